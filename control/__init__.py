@@ -1,0 +1,1 @@
+"""Control laws and kinematics: pure functions of state and input."""

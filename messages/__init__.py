@@ -1,0 +1,1 @@
+"""What travels: topics, message types, codec, transports, the log."""

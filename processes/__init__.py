@@ -1,0 +1,1 @@
+"""What runs: the node contract, the executors, the process table, the processes."""

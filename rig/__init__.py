@@ -1,0 +1,1 @@
+"""The hardware, real or simulated: geometry, mechanics, plant, drivers."""

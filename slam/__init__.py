@@ -1,0 +1,1 @@
+"""Touch to map: tactile images, RatSLAM, odometry, metrics. Pure."""
