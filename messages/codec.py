@@ -1,0 +1,254 @@
+"""Frames: how a message is laid out in bytes.
+
+    frame = topic name, one zero byte, msgpack array [version, source, epoch, seq, t, fields ...]
+
+The topic comes first so that subscriptions filter on it. Scalars are msgpack values; all float32
+arrays of fixed length share one raw little-endian block, every other array is a block of its own
+with its row count implied by its length. Fields follow the order of the type. Encoding and decoding
+check kind, length, version and range and name what is wrong in one line.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import Any, Final, NamedTuple, get_type_hints
+
+import msgpack
+import numpy as np
+
+from vibrissa.messages.errors import DecodeError, EncodeError
+from vibrissa.messages.fields import Array, Field
+from vibrissa.messages.topics import TOPICS, Topic
+
+MAX_FRAME_BYTES: Final = 16 << 20
+_HEADER: Final = 5  # version, source, epoch, seq, t
+_I64: Final = 2**63
+
+
+class Message(NamedTuple):
+    """An identified message: (topic, source, epoch, seq) is unique in a run; t in ns is logical."""
+
+    topic: str
+    source: str
+    epoch: int
+    seq: int
+    t: int
+    body: Any
+
+
+class Codec:
+    """Packs and unpacks the bodies of one message type."""
+
+    def __init__(self, topic: Topic) -> None:
+        self.topic = topic.name
+        self.type: Any = topic.type
+        self.version: int = self.type.version
+        self.prefix = topic.name.encode() + b"\0"
+        hints = get_type_hints(self.type, include_extras=True)
+        self.fields: dict[str, Field] = {
+            f.name: hints[f.name].__metadata__[0] for f in dataclasses.fields(self.type)
+        }
+        block = [n for n, f in self.fields.items() if isinstance(f, Array) and _shared(f)]
+        self._block_names = block
+        self._block_slices: list[tuple[str, int, int]] = []
+        offset = 0
+        for name in block:
+            size = self._array(name).shape[0]
+            self._block_slices.append((name, offset, offset + size))
+            offset += size
+        self._block_floats = offset
+        self._block_limit = min((self._array(n).limit for n in block), default=0.0)
+        self._others = [n for n in self.fields if n not in block]
+        self._length = _HEADER + len(self._others) + bool(block)
+
+    def encode(self, source: str, epoch: int, seq: int, t: int, body: Any) -> bytes:
+        """Frame a body. Raises EncodeError when a field breaks its declaration."""
+        if type(body) is not self.type:
+            raise EncodeError(
+                f"{self.topic}: expected {self.type.__name__}, found {type(body).__name__}"
+            )
+        values: list[Any] = [self.version, source, epoch, seq, t]
+        for name in self._others:
+            field = self.fields[name]
+            value = getattr(body, name)
+            fault = field.fault(value)
+            if fault:
+                raise EncodeError(f"{self.topic}.{name}: {fault}")
+            values.append(value.tobytes() if isinstance(field, Array) else value)
+        if self._block_names:
+            values.append(self._join(body))
+        packed: bytes = msgpack.packb(values)
+        return self.prefix + packed
+
+    def decode(self, frame: bytes) -> Message:
+        """Unframe a message. Raises DecodeError naming topic, field, expectation and finding."""
+        values = self._unpack(frame)
+        _, source, epoch, seq, t = values[:_HEADER]
+        found: dict[str, Any] = {}
+        for name, value in zip(self._others, values[_HEADER:], strict=False):
+            field = self.fields[name]
+            if isinstance(field, Array):
+                value = self._array_from(name, field, value)  # noqa: PLW2901
+            else:
+                fault = field.fault(value)
+                if fault:
+                    raise DecodeError(f"{self.topic}.{name} from {source} #{seq}: {fault}")
+            found[name] = value
+        if self._block_names:
+            self._split(values[-1], found, source, seq)
+        return Message(self.topic, source, epoch, seq, t, self.type(**found))
+
+    def json_schema(self) -> str:
+        """A JSON Schema of the msgpack array, attached to every channel of a log."""
+        items: list[dict[str, Any]] = [
+            {"title": "version", "const": self.version},
+            {"title": "source", "type": "string"},
+            {"title": "epoch", "type": "integer"},
+            {"title": "seq", "type": "integer"},
+            {"title": "t", "type": "integer", "description": "logical time, ns"},
+        ]
+        items += [{"title": n, **self.fields[n].json_schema()} for n in self._others]
+        if self._block_names:
+            parts = ", ".join(
+                f"{n}[{b - a}] {self._array(n).unit}" for n, a, b in self._block_slices
+            )
+            items.append(
+                {
+                    "title": "block",
+                    "type": "string",
+                    "contentEncoding": "binary",
+                    "description": f"raw little-endian float32: {parts}",
+                }
+            )
+        title = f"{self.type.__name__} v{self.version}"
+        schema = {"title": title, "type": "array", "prefixItems": items, "items": False}
+        return json.dumps(schema, sort_keys=True)
+
+    def _array(self, name: str) -> Array:
+        field = self.fields[name]
+        assert isinstance(field, Array)
+        return field
+
+    def _join(self, body: Any) -> bytes:
+        parts = [getattr(body, name) for name in self._block_names]
+        try:
+            block = np.concatenate(parts)
+        except (ValueError, TypeError):
+            block = np.empty(0, np.float32)
+        if (
+            block.dtype != np.float32
+            or block.size != self._block_floats
+            or not np.maximum.reduce(np.abs(block)) <= self._block_limit
+        ):
+            self._blame_block(body)
+        return block.tobytes()
+
+    def _blame_block(self, body: Any) -> None:
+        for name in self._block_names:
+            fault = self._array(name).fault(getattr(body, name))
+            if fault:
+                raise EncodeError(f"{self.topic}.{name}: {fault}")
+
+    def _split(self, raw: Any, found: dict[str, Any], source: str, seq: int) -> None:
+        where = f"{self.topic} from {source} #{seq}"
+        if type(raw) is not bytes or len(raw) != 4 * self._block_floats:
+            size = f"{len(raw)} bytes" if type(raw) is bytes else type(raw).__name__
+            raise DecodeError(f"{where}: expected {4 * self._block_floats} bytes, found {size}")
+        block = np.frombuffer(raw, "<f4")
+        fine = np.maximum.reduce(np.abs(block)) <= self._block_limit
+        for name, start, stop in self._block_slices:
+            part = block[start:stop]
+            if not fine:
+                fault = self._array(name).range_fault(part)
+                if fault:
+                    raise DecodeError(f"{self.topic}.{name} from {source} #{seq}: {fault}")
+            found[name] = part
+
+    def _array_from(self, name: str, field: Array, raw: Any) -> Any:
+        where = f"{self.topic}.{name}"
+        if type(raw) is not bytes:
+            raise DecodeError(f"{where}: expected a block of bytes, found {type(raw).__name__}")
+        if len(raw) > field.longest * field.numpy_dtype.itemsize:
+            raise DecodeError(
+                f"{where}: expected at most {field.longest} numbers, found {len(raw)} bytes"
+            )
+        if len(raw) % field.bytes_per_row or (field.fixed and len(raw) != field.bytes_per_row):
+            of = "" if field.fixed else "a multiple of "
+            raise DecodeError(
+                f"{where}: expected {of}{field.bytes_per_row} bytes, found {len(raw)}"
+            )
+        value = np.frombuffer(raw, field.numpy_dtype).reshape(field.shape)
+        fault = field.range_fault(value)
+        if fault:
+            raise DecodeError(f"{where}: {fault}")
+        return value
+
+    def _unpack(self, frame: bytes) -> list[Any]:
+        try:
+            values = msgpack.unpackb(frame[len(self.prefix) :], use_list=True)
+        except Exception as error:
+            raise DecodeError(
+                f"{self.topic}: expected a msgpack array, found {len(frame)} bytes that are not "
+                f"({type(error).__name__})"
+            ) from None
+        if type(values) is not list or len(values) < _HEADER:
+            raise DecodeError(f"{self.topic}: expected an array of {self._length} values")
+        version = values[0]
+        if version != self.version:
+            raise DecodeError(
+                f"{self.topic}: expected version {self.version}, found {_short(version)}"
+            )
+        if len(values) != self._length:
+            raise DecodeError(f"{self.topic}: expected {self._length} values, found {len(values)}")
+        _, source, epoch, seq, t = values[:_HEADER]
+        if type(source) is not str or not 0 < len(source) <= 40:
+            raise DecodeError(f"{self.topic}: expected a source name, found {_short(source)}")
+        for name, value, low in (("epoch", epoch, 0), ("seq", seq, 0), ("t", t, -_I64)):
+            if type(value) is not int or not low <= value < _I64:
+                raise DecodeError(
+                    f"{self.topic} from {source}: expected {name} to be a whole number, "
+                    f"found {_short(value)}"
+                )
+        return values
+
+
+def _shared(field: Array) -> bool:
+    return field.dtype == "<f4" and field.fixed and len(field.shape) == 1
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 40 else text[:37] + "..."
+
+
+CODECS: Final[dict[str, Codec]] = {name: Codec(topic) for name, topic in TOPICS.items()}
+_BY_PREFIX: Final[dict[bytes, Codec]] = {c.prefix[:-1]: c for c in CODECS.values()}
+
+
+def topic_of(frame: bytes) -> str:
+    """The topic a frame belongs to. Raises DecodeError when it names none of the table."""
+    if len(frame) > MAX_FRAME_BYTES:
+        raise DecodeError(f"frame: expected at most {MAX_FRAME_BYTES} bytes, found {len(frame)}")
+    codec = _BY_PREFIX.get(frame[: frame.find(b"\0")])
+    if codec is None:
+        raise DecodeError(f"frame: expected a topic of the table, found {frame[:24]!r}")
+    return codec.topic
+
+
+def decode(frame: bytes) -> Message:
+    """Unframe a message of any topic. Raises DecodeError."""
+    return CODECS[topic_of(frame)].decode(frame)
+
+
+def encode(message: Message) -> bytes:
+    """Frame a message. Raises EncodeError."""
+    topic, source, epoch, seq, t, body = message
+    return CODECS[topic].encode(source, epoch, seq, t, body)
+
+
+def header(frame: bytes) -> tuple[str, str, int, int, int]:
+    """(topic, source, epoch, seq, t) of a frame, its fields unchecked. Raises DecodeError."""
+    codec = CODECS[topic_of(frame)]
+    _, source, epoch, seq, t, *_ = codec._unpack(frame)
+    return codec.topic, source, epoch, seq, t

@@ -1,0 +1,170 @@
+"""How frames get from one process to the others: ZeroMQ between processes, memory inside one.
+
+A `Port` is a process's side of the bus: it publishes its own frames and receives what it
+subscribed to. Both kinds keep each publisher's order, never drop a frame, and know who listens, so
+that nothing is sent before everybody can hear it.
+"""
+
+from __future__ import annotations
+
+import collections
+import ipaddress
+from collections.abc import Iterable, Mapping
+from typing import Protocol
+from urllib.parse import urlparse
+
+import zmq
+
+from vibrissa.messages.codec import MAX_FRAME_BYTES
+from vibrissa.messages.errors import TransportError
+
+
+class Port(Protocol):
+    """One process's side of the bus."""
+
+    def publish(self, frame: bytes) -> None:
+        """Send a frame to everybody who subscribed to its topic. Never blocks, never drops."""
+
+    def receive(self, timeout: float) -> bytes | None:
+        """The next frame, or None after `timeout` seconds; 0 looks without waiting."""
+
+    def subscribers(self) -> Mapping[str, int]:
+        """How many listeners each published topic has by now."""
+
+    def close(self) -> None:
+        """Deliver what is still on its way to running listeners, then let go."""
+
+
+class ZmqPort:
+    """A bus over ZeroMQ PUB/SUB: binds one publishing endpoint, connects to the others'."""
+
+    def __init__(
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        endpoint: str,
+        topics: Iterable[str] = (),
+        connect: Iterable[str] = (),
+        *,
+        linger_ms: int = 2000,
+    ) -> None:
+        """Bind `endpoint` and subscribe to `topics` at the endpoints in `connect`.
+
+        Raises TransportError when an endpoint is in use, malformed or not on this machine.
+        """
+        self._subscribers: collections.Counter[str] = collections.Counter()
+        self._waited_ms = -1
+        self._out = context.socket(zmq.XPUB)
+        self._in = context.socket(zmq.SUB)
+        try:
+            self._out.set(zmq.XPUB_VERBOSE, 1)
+            self._out.set(zmq.SNDHWM, 0)
+            self._out.set(zmq.LINGER, linger_ms)
+            self._in.set(zmq.RCVHWM, 0)
+            self._in.set(zmq.LINGER, 0)
+            self._in.set(zmq.MAXMSGSIZE, 4 * MAX_FRAME_BYTES)
+            check_endpoint(endpoint)
+            try:
+                self._out.bind(endpoint)
+            except zmq.ZMQError as error:
+                raise TransportError(f"can't bind {endpoint}: {error.strerror}") from None
+            for topic in topics:
+                self._in.subscribe(topic.encode() + b"\0")
+            for other in connect:
+                check_endpoint(other)
+                self._in.connect(other)
+        except Exception:
+            self.close()
+            raise
+
+    def publish(self, frame: bytes) -> None:
+        self._out.send(frame, zmq.NOBLOCK)
+
+    def receive(self, timeout: float) -> bytes | None:
+        milliseconds = int(timeout * 1000)
+        try:
+            if milliseconds <= 0:
+                return self._in.recv(zmq.NOBLOCK)
+            if milliseconds != self._waited_ms:
+                self._in.set(zmq.RCVTIMEO, milliseconds)
+                self._waited_ms = milliseconds
+            return self._in.recv()
+        except zmq.Again:
+            return None
+
+    def subscribers(self) -> Mapping[str, int]:
+        while True:
+            try:
+                note = self._out.recv(zmq.NOBLOCK)
+            except zmq.Again:
+                return self._subscribers
+            topic = note[1:].removesuffix(b"\0").decode(errors="replace")
+            if note[:1] == b"\x01":
+                self._subscribers[topic] += 1
+            elif note[:1] == b"\x00":
+                self._subscribers[topic] -= 1
+
+    def close(self) -> None:
+        self._in.close()
+        self._out.close()
+
+
+class Hub:
+    """Joins `MemoryPort`s of one process."""
+
+    def __init__(self) -> None:
+        self._inboxes: dict[str, list[collections.deque[bytes]]] = {}
+
+    def port(self, topics: Iterable[str] = ()) -> MemoryPort:
+        """A new port that listens to `topics`."""
+        return MemoryPort(self._inboxes, topics)
+
+
+class MemoryPort:
+    """A bus inside one process: a frame is in every listener's inbox when publish returns."""
+
+    def __init__(
+        self, inboxes: dict[str, list[collections.deque[bytes]]], topics: Iterable[str]
+    ) -> None:
+        self._inboxes = inboxes
+        self._inbox: collections.deque[bytes] = collections.deque()
+        for topic in topics:
+            inboxes.setdefault(topic, []).append(self._inbox)
+
+    def publish(self, frame: bytes) -> None:
+        for inbox in self._inboxes.get(frame[: frame.find(b"\0")].decode(), ()):
+            inbox.append(frame)
+
+    def receive(self, timeout: float) -> bytes | None:
+        return self._inbox.popleft() if self._inbox else None
+
+    def subscribers(self) -> Mapping[str, int]:
+        return {topic: len(inboxes) for topic, inboxes in self._inboxes.items()}
+
+    def close(self) -> None:
+        for inboxes in self._inboxes.values():
+            inboxes[:] = [inbox for inbox in inboxes if inbox is not self._inbox]
+
+
+def check_endpoint(endpoint: str) -> None:
+    """Refuse what is not on this machine. Raises TransportError."""
+    url = urlparse(endpoint)
+    if url.scheme == "ipc" and len(endpoint) - len("ipc://") <= zmq.IPC_PATH_MAX_LEN:
+        return
+    if url.scheme == "ipc":
+        raise TransportError(
+            f"endpoint {endpoint}: expected a path of at most {zmq.IPC_PATH_MAX_LEN} characters"
+        )
+    if url.scheme != "tcp":
+        raise TransportError(f"endpoint {endpoint}: expected ipc:// or tcp://")
+    if not _loopback(url.hostname or ""):
+        raise TransportError(
+            f"endpoint {endpoint}: expected an address of this machine (127.x.x.x, localhost, "
+            "[::1]); others are refused because traffic is not encrypted"
+        )
+
+
+def _loopback(host: str) -> bool:
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

@@ -1,0 +1,71 @@
+"""The node contract: a process is a step function, and everything that can change it is an input.
+
+A node sees one message at a time and answers with the messages that follow from it. It reads no
+clock, no file, no environment and no global state, so that the same inputs in the same order always
+give the same bytes. Whatever hosts it (live, fused, lockstep) drives it through a `Stepper`, which
+gives outputs their identity and keeps the running digest that receipts are made of.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple, Protocol
+
+from vibrissa.messages.codec import CODECS, Message, topic_of
+from vibrissa.messages.types import TICK_NS, TimerTick
+
+Output = tuple[str, Any]
+"""(topic, body): the host adds source, epoch, seq, and the t of the input that caused it."""
+
+
+class Node(Protocol):
+    """A step function with its state."""
+
+    def step(self, message: Message) -> Iterable[Output]:
+        """Consume one message; return what follows from it, in order."""
+
+
+class Step(NamedTuple):
+    """What one step consumed and what came of it."""
+
+    stream: tuple[str, str, int]
+    """(topic, source, epoch) of the input."""
+    seq: int
+    t: int
+    outputs: Sequence[bytes]
+    digest: int
+    """Running CRC-32 over every input and output frame of the node so far."""
+
+
+class Stepper:
+    """Drives one node by frames: decodes, steps, identifies and encodes, keeps the digest."""
+
+    def __init__(self, name: str, node: Node, epoch: int = 0) -> None:
+        self.name = name
+        self.node = node
+        self.epoch = epoch
+        self.steps = 0
+        self.digest = 0
+        self._seq: dict[str, int] = {}
+
+    def step(self, frame: bytes) -> Step:
+        """Feed one frame. Raises DecodeError or EncodeError before the digest moves."""
+        message = CODECS[topic_of(frame)].decode(frame)
+        outputs = [self._frame(topic, message.t, body) for topic, body in self.node.step(message)]
+        digest = zlib.crc32(frame, self.digest)
+        for output in outputs:
+            digest = zlib.crc32(output, digest)
+        self.digest = digest
+        self.steps += 1
+        return Step(message[:3], message.seq, message.t, outputs, digest)
+
+    def _frame(self, topic: str, t: int, body: Any) -> bytes:
+        seq = self._seq.get(topic, 0)
+        self._seq[topic] = seq + 1
+        return CODECS[topic].encode(self.name, self.epoch, seq, t, body)
+
+
+def timer_frame(node: str, tick: int) -> bytes:
+    """The input that a host's timer makes at a tick; a re-run rebuilds it from its receipt."""
+    return CODECS["host.timer"].encode(node, 0, tick, tick * TICK_NS, TimerTick(tick))

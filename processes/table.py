@@ -1,0 +1,115 @@
+"""The process table: the second of the two tables from which the rest of the system is derived."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Literal
+
+from vibrissa.messages.topics import TOPICS
+
+if TYPE_CHECKING:
+    from vibrissa.processes.config import Experiment
+    from vibrissa.processes.node import Node
+
+Pacing = Literal["timer", "arrival", "drain"]
+"""How a live host waits: for its own 2 kHz timer, for each message, or a few ms at a time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Process:
+    """One row: a node, what it hears, what it says, and how it is hosted.
+
+    priority is SCHED_FIFO's, 0 for the ordinary scheduler. `source` marks a stand-in for hardware:
+    what-if re-runs take its messages from the log instead of stepping it. `silence` is how many
+    seconds without a sign of life end the run. `probe` names a topic pair whose time between going
+    out and coming back is measured as reaction latency.
+    """
+
+    name: str
+    node: str
+    hears: tuple[str, ...]
+    says: tuple[str, ...]
+    pacing: Pacing
+    priority: int
+    silence: float = 2.0
+    source: bool = False
+    probe: tuple[str, str] | None = None
+
+
+PROCESSES: Final[dict[str, Process]] = {
+    row.name: row
+    for row in (
+        Process(
+            "rig",
+            "vibrissa.processes.rig:RigNode",
+            hears=("host.timer", "head.command", "arm.setpoint", "run.event"),
+            says=("rig.sample", "rig.arm"),
+            pacing="timer",
+            priority=50,
+            source=True,
+        ),
+        Process(
+            "sampler",
+            "vibrissa.processes.sampler:SamplerNode",
+            hears=("rig.sample", "whisk.command", "run.event", "host.event"),
+            says=("head.sample", "head.command", "node.event"),
+            pacing="arrival",
+            priority=48,
+            probe=("head.sample", "whisk.command"),
+        ),
+        Process(
+            "whisk",
+            "vibrissa.processes.whisk:WhiskNode",
+            hears=("head.sample", "run.event"),
+            says=("whisk.command", "whisk.cycle", "whisk.calibration", "node.event"),
+            pacing="arrival",
+            priority=46,
+        ),
+        Process(
+            "arm",
+            "vibrissa.processes.arm:ArmNode",
+            hears=("rig.arm", "run.event", "host.event"),
+            says=("arm.state", "arm.setpoint", "node.event"),
+            pacing="arrival",
+            priority=40,
+        ),
+        Process(
+            "slam",
+            "vibrissa.processes.slam:SlamNode",
+            hears=("head.sample", "whisk.cycle", "whisk.calibration", "arm.state", "run.event"),
+            says=("slam.view", "slam.pose", "slam.map", "eval.metrics", "node.event"),
+            pacing="drain",
+            priority=0,
+            silence=5.0,
+        ),
+    )
+}
+
+RECORDER_SILENCE: Final = 10.0
+"""Seconds a recorder may be stopped before the run ends; publishers hold its messages meanwhile."""
+
+PUBLISHED_BY_HOSTS: Final = ("host.event", "node.receipt", "node.telemetry")
+"""What every host says beside its nodes."""
+
+
+def build(name: str, experiment: Experiment) -> Node:
+    """A fresh node of the table in its initial state, made from the experiment alone."""
+    module, _, attribute = PROCESSES[name].node.partition(":")
+    node: Node = getattr(importlib.import_module(module), attribute)(experiment)
+    return node
+
+
+def listeners(topic: str) -> list[str]:
+    """The processes that hear a topic from others."""
+    return [p.name for p in PROCESSES.values() if topic in p.hears]
+
+
+def producers(topic: str) -> list[str]:
+    """The processes that may say a topic."""
+    if topic in PUBLISHED_BY_HOSTS:
+        return list(PROCESSES)
+    row = TOPICS[topic]
+    if row.producer == "supervisor":
+        return ["supervisor"]
+    return [p.name for p in PROCESSES.values() if topic in p.says]
