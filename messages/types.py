@@ -152,7 +152,8 @@ class SlamView:
 
     version: ClassVar[int] = 1
     cycle: Annotated[int, Int(0, 2**31)]
-    max_angle: Pixels
+    max_angle_gated: Pixels
+    max_angle_ungated: Pixels
     contact_angle: Pixels
     template: Annotated[int, Int(0, 2**31)]
     new: Annotated[int, Int(0, 1)]

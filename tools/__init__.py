@@ -1,1 +1,1 @@
-"""What a person types or looks at: the command line, benchmarks, pictures."""
+"""What a person types or looks at: the command line, benchmarks, pictures, generated documents."""

@@ -1,0 +1,58 @@
+"""The arm process: executes the circuit on the arm and publishes the arm's state."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vibrissa.control.arm_path import ArmPath, Motion, circuit
+from vibrissa.messages.codec import Message
+from vibrissa.messages.types import TICK_HZ, TICK_NS, ArmReading, ArmSetpoint, ArmState
+from vibrissa.processes.config import Experiment
+from vibrissa.processes.node import Output
+from vibrissa.rig.maze import parse_maze
+
+ARM_TICKS = 16
+"""Ticks per arm cycle: 125 Hz, the UR10's CB3 controller."""
+
+
+def make_path(experiment: Experiment) -> ArmPath:
+    """The timed circuit of an experiment; raised and at rest while whisking is calibrated.
+
+    Raises MazeError or ArmPathError.
+    """
+    maze = parse_maze(experiment.maze.text, experiment.maze.file)
+    motion = Motion(
+        speed=experiment.arm.speed,
+        lift=experiment.arm.lift,
+        t_start=experiment.calibration_ticks / TICK_HZ,
+    )
+    route = circuit(maze.width, maze.height, experiment.arm.sequence, pitch=maze.pitch)
+    return ArmPath(route, motion)
+
+
+class ArmNode:
+    """Streams the set-point of the next arm cycle; moves only between start and stop."""
+
+    def __init__(self, experiment: Experiment) -> None:
+        self._path = make_path(experiment)
+        self._moving = False
+        self._setpoint = np.array(self._path.pose(0), np.float64)
+
+    def step(self, message: Message) -> list[Output]:
+        match message.topic:
+            case "rig.arm":
+                return self._cycle(message.body)
+            case "run.event" if message.body.kind == "start":
+                self._moving = True
+            case "run.event" | "host.event" if message.body.kind in ("retract", "stop"):
+                self._moving = False
+        return []
+
+    def _cycle(self, reading: ArmReading) -> list[Output]:
+        following = reading.tick + ARM_TICKS
+        if self._moving:
+            self._setpoint = np.array(self._path.pose(following * TICK_NS), np.float64)
+        return [
+            ("arm.state", ArmState(reading.tick, reading.pose, int(self._moving))),
+            ("arm.setpoint", ArmSetpoint(following, self._setpoint)),
+        ]

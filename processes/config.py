@@ -1,0 +1,221 @@
+"""Experiment files: TOML checked by a schema, resolved into everything a run depends on.
+
+A resolved experiment holds the text of its maze, so that it alone (it travels in the log) rebuilds
+every node of the run.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from vibrissa.messages.types import TICK_HZ
+from vibrissa.processes.results import RunError
+
+DEFAULT_MAZE = "board7x5.maze"
+RETRACT_S = 0.5
+"""The last half second of a run: whiskers retract, the arm holds."""
+
+
+class Section(BaseModel):
+    """A table of an experiment file: unknown keys are refused, values can't change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Run(Section):
+    """[run]"""
+
+    duration: Annotated[float, Field(ge=1, le=86400 * 7, description="s, simulated or real")] = 30.0
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 1
+    together: Annotated[
+        list[list[str]], Field(description="groups of nodes that share one process")
+    ] = []
+    realtime: Annotated[bool, Field(description="ask for SCHED_FIFO and locked memory")] = True
+    transport: Annotated[Literal["ipc", "tcp"], Field(description="tcp: loopback only")] = "ipc"
+    tcp_port: Annotated[int, Field(ge=1024, le=65000, description="first of eight ports")] = 5790
+
+
+class Maze(Section):
+    """[maze]"""
+
+    file: Annotated[str, Field(description="a micromouse maze file, or one that is shipped")] = (
+        DEFAULT_MAZE
+    )
+    text: Annotated[str, Field(description="the file's content; filled in when it is read")] = ""
+
+
+class Head(Section):
+    """[head]: the simulated head. Ranges are those the mechanics are tested in."""
+
+    motor_stiffness: Annotated[float, Field(gt=0, le=100, description="N m/rad")] = 0.3
+    motor_frequency: Annotated[float, Field(ge=1, le=100, description="Hz")] = 10.0
+    moment_noise: Annotated[float, Field(ge=0, le=1e-3, description="N m, standard deviation")] = (
+        1e-5
+    )
+    angle_noise: Annotated[float, Field(ge=0, le=0.1, description="rad, standard deviation")] = (
+        0.1 * 3.141592653589793 / 180
+    )
+
+
+class Whisk(Section):
+    """[whisk]"""
+
+    controller: Annotated[str, Field(description="open_loop or rcp")] = "rcp"
+    period: Annotated[float, Field(ge=0.1, le=10, description="s per whisk cycle")] = 1.0
+    calibration_cycles: Annotated[int, Field(ge=1, le=1000)] = 4
+    rcp_gain: Annotated[float, Field(ge=0, le=1000, description="in contact stiffnesses")] = 3.0
+    rcp_window: Annotated[float, Field(ge=0.0005, le=1, description="s, averaging window")] = 0.04
+
+
+class Arm(Section):
+    """[arm]: the circuit through the outer cells of the maze."""
+
+    sequence: Annotated[
+        str, Field(pattern="^[CA]{1,100}$", description="C clockwise, A anticlockwise circuits")
+    ] = "CCCAAACACA"
+    speed: Annotated[float, Field(gt=0, le=0.5, description="m/s")] = 0.04
+    lift: Annotated[
+        float, Field(ge=0, le=0.3, description="m above the working height while calibrating")
+    ] = 0.1
+
+
+class Slam(Section):
+    """[slam]"""
+
+    image: Annotated[
+        Literal["max_angle_gated", "max_angle_ungated", "contact_angle"],
+        Field(description="gated: still in contact near full protraction"),
+    ] = "max_angle_gated"
+    preset: Annotated[str, Field(description="named RatSLAM parameter set")] = "whisker"
+    parameters: Annotated[
+        dict[str, float | int | bool], Field(description="OpenRatSLAM parameters over the preset")
+    ] = {}
+    odometry_noise: Annotated[str, Field(description="named odometry noise model")] = "none"
+
+
+class Experiment(Section):
+    """A whole experiment file."""
+
+    run: Run = Run()
+    maze: Maze = Maze()
+    head: Head = Head()
+    whisk: Whisk = Whisk()
+    arm: Arm = Arm()
+    slam: Slam = Slam()
+
+    @property
+    def ticks(self) -> int:
+        """Length of the run in ticks."""
+        return round(self.run.duration * TICK_HZ)
+
+    @property
+    def retract_tick(self) -> int:
+        """The tick at which whiskers start to retract for the end of the run."""
+        return self.ticks - round(RETRACT_S * TICK_HZ)
+
+    @property
+    def period_ticks(self) -> int:
+        """Length of a whisk cycle in ticks."""
+        return round(self.whisk.period * TICK_HZ)
+
+    @property
+    def calibration_ticks(self) -> int:
+        """How long the head is held free at the start."""
+        return self.whisk.calibration_cycles * self.period_ticks
+
+    @model_validator(mode="after")
+    def _fits(self) -> Experiment:
+        from vibrissa.processes.table import PROCESSES
+
+        seen: set[str] = set()
+        for group in self.run.together:
+            for node in group:
+                if node not in PROCESSES:
+                    raise ValueError(f"run.together: {node!r} is none of {', '.join(PROCESSES)}")
+                if node in seen:
+                    raise ValueError(f"run.together: {node!r} is named twice")
+                seen.add(node)
+        return self
+
+
+def load_experiment(
+    path: Path | None = None,
+    *,
+    duration: float | None = None,
+    controller: str | None = None,
+    seed: int | None = None,
+) -> Experiment:
+    """Read, check and resolve an experiment file; None gives the default experiment.
+
+    The keyword arguments, where given, replace what the file says. Raises RunError with one line
+    that names the file, the key, the value and what is allowed.
+    """
+    where = str(path) if path else "experiment"
+    content: dict[str, Any] = {}
+    if path is not None:
+        try:
+            content = tomllib.loads(path.read_text())
+        except OSError as error:
+            raise RunError(f"{path}: {error.strerror}") from None
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise RunError(f"{path}: not a TOML file: {error}") from None
+    overrides = {
+        ("run", "duration"): duration,
+        ("whisk", "controller"): controller,
+        ("run", "seed"): seed,
+    }
+    for (section, key), value in overrides.items():
+        if value is not None and isinstance(content.setdefault(section, {}), dict):
+            content[section][key] = value
+    try:
+        experiment = Experiment.model_validate(content, strict=False)
+    except ValidationError as error:
+        raise RunError(f"{where}: " + "; ".join(_complaints(error))) from None
+    if not experiment.maze.text:
+        text = _maze_text(experiment.maze.file, path.parent if path else Path())
+        maze = experiment.maze.model_copy(update={"text": text})
+        experiment = experiment.model_copy(update={"maze": maze})
+    return experiment
+
+
+def _complaints(error: ValidationError) -> Iterator[str]:
+    for item in error.errors():
+        key = ".".join(str(part) for part in item["loc"]) or "experiment"
+        if item["type"] == "extra_forbidden":
+            yield f"{key}: unknown key (expected one of {', '.join(_siblings(item['loc']))})"
+        else:
+            found = item.get("input")
+            shown = "" if isinstance(found, dict) else f", found {found!r}"
+            yield f"{key}: {item['msg']}{shown}"
+
+
+def _siblings(location: tuple[int | str, ...]) -> list[str]:
+    model: Any = Experiment
+    for part in location[:-1]:
+        model = model.model_fields[part].annotation
+    return list(model.model_fields)
+
+
+def _maze_text(name: str, folder: Path) -> str:
+    """The text of a maze file: relative to the experiment file, or one of those shipped."""
+    candidates = [folder / name, Path(name)]
+    for candidate in candidates:
+        if candidate.is_file():
+            try:
+                return candidate.read_text()
+            except (OSError, UnicodeDecodeError) as error:
+                raise RunError(f"maze.file {candidate}: can't be read as text: {error}") from None
+    shipped = resources.files("vibrissa.rig") / "mazes"
+    if "/" not in name and (shipped / name).is_file():
+        return (shipped / name).read_text()
+    names = sorted(f.name for f in shipped.iterdir() if f.name.endswith(".maze"))
+    raise RunError(
+        f"maze.file {name!r}: no such file, here or beside the experiment "
+        f"(shipped: {', '.join(names)})"
+    )

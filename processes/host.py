@@ -1,0 +1,280 @@
+"""The live host: a process that runs nodes of the table against the clock and the bus.
+
+It consumes messages in arrival order, lets each node step, publishes what they say, and writes a
+receipt for every step. Everything is imported, compiled, allocated and rehearsed before tick 0; the
+garbage collector is off on hot nodes. Nothing here changes what a node computes.
+"""
+
+from __future__ import annotations
+
+import collections
+import os
+import signal
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+import zmq
+
+from vibrissa.messages.codec import CODECS
+from vibrissa.messages.errors import MessageError
+from vibrissa.messages.transport import ZmqPort
+from vibrissa.messages.types import TICK_NS, Event, Telemetry
+from vibrissa.processes import realtime
+from vibrissa.processes.config import Experiment
+from vibrissa.processes.control import ControlLine
+from vibrissa.processes.group import Group, Steps
+from vibrissa.processes.layout import Layout
+from vibrissa.processes.node import Step, Stepper, timer_frame
+from vibrissa.processes.receipts import ReceiptBook
+from vibrissa.processes.stats import Clocking, Histogram
+from vibrissa.processes.table import PROCESSES, build
+
+HOUSEKEEPING_NS: Final = 50_000_000
+RECEIPT_BATCH: Final = 400
+DRAIN_S: Final = 0.005
+PARTING_TICKS: Final = 600
+"""Ticks a host goes on stepping after its supervisor is gone, so that what moves can stop."""
+
+
+class Host:
+    """One process of a live run."""
+
+    def __init__(self, name: str, layout: Layout) -> None:
+        self.name = name
+        self.layout = layout
+        self.nodes = layout.hosts[name]
+        rows = [PROCESSES[n] for n in self.nodes]
+        self.pacing = rows[0].pacing
+        experiment = Experiment.model_validate_json(layout.experiment)
+        self.last_tick = experiment.ticks
+        for row in rows:
+            rehearse(row.name, experiment)
+        self.missing = realtime.prepare(
+            max(r.priority for r in rows) if experiment.run.realtime else 0
+        )
+        self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self.control = ControlLine(self.context, layout.endpoints["control"], name)
+        self.control.say("hello", pid=os.getpid(), missing=self.missing)
+        self.port = ZmqPort(
+            self.context, layout.endpoints[name], layout.hears(name), layout.connections(name)
+        )
+        self.steppers = {n: Stepper(n, build(n, experiment)) for n in self.nodes}
+        self.books = {n: ReceiptBook(n) for n in self.nodes}
+        self.clocks = {n: Clocking() for n in self.nodes}
+        self.group = Group([(self.steppers[r.name], r.hears) for r in rows], self._stepped)
+        self.sent: collections.Counter[str] = collections.Counter()
+        self.t0 = 0
+        self.t = 0
+        self.stopping = False
+        self._done = False
+        self._own_seq: collections.Counter[tuple[str, str]] = collections.Counter()
+        self._probes = {r.name: r.probe for r in rows if r.probe}
+        self._drivers = {r.name: r.hears[0] for r in rows}
+        self._probed: dict[int, int] = {}
+        self._housekept = 0
+        self._reported = 0
+        self._parent = os.getppid()
+        self._leave_at = 0
+        self._mark = 0
+        self._outgoing: list[bytes] = []
+
+    def run(self) -> None:
+        """Barrier, loop, farewell."""
+        self._wait_for_go()
+        loop: dict[str, Callable[[], None]] = {
+            "timer": self._timer_loop,
+            "arrival": self._arrival_loop,
+            "drain": self._drain_loop,
+        }
+        cpu = time.process_time()
+        try:
+            loop[self.pacing]()
+        except MessageError as error:
+            self._fault(str(error))
+        self._flush(final=True)
+        self.control.say(
+            "bye",
+            sent=dict(self.sent),
+            stats={n: c.summary() for n, c in self.clocks.items()},
+            cpu_s=time.process_time() - cpu,
+            counters={n: counters(s) for n, s in self.steppers.items()},
+        )
+        self._wait_to_leave()
+
+    def _wait_for_go(self) -> None:
+        expected = self.layout.audience(self.name)
+        told = False
+        while True:
+            heard = self.port.subscribers()
+            if not told and all(heard.get(topic, 0) >= n for topic, n in expected.items()):
+                self.control.say("ready")
+                told = True
+            order = self.control.hear(0.02)
+            if order and order["kind"] == "go":
+                self.t0 = order["t0_ns"]
+                return
+            if os.getppid() != self._parent or (order and order["kind"] == "leave"):
+                raise SystemExit(1)
+
+    def _timer_loop(self) -> None:
+        tick = 0
+        while not self.stopping:
+            if tick >= self.last_tick:
+                self._done = True
+                frame = self.port.receive(0.02)
+                if frame is not None:
+                    self._feed(frame)
+            else:
+                realtime.sleep_until(self.t0 + tick * TICK_NS)
+                while (frame := self.port.receive(0)) is not None:
+                    self._feed(frame)
+                if self.stopping:
+                    break
+                self._feed(timer_frame(self.nodes[0], tick))
+                tick += 1
+            self._housekeep()
+
+    def _arrival_loop(self) -> None:
+        while not self.stopping:
+            frame = self.port.receive(0.05)
+            if frame is not None:
+                self._feed(frame)
+            self._housekeep()
+
+    def _drain_loop(self) -> None:
+        while not self.stopping:
+            frame = self.port.receive(0)
+            if frame is None:
+                self._housekeep()
+                time.sleep(DRAIN_S)
+            else:
+                self._feed(frame)
+
+    def _feed(self, frame: bytes) -> None:
+        self._mark = time.monotonic_ns()
+        self.group.feed(frame)
+
+    def _stepped(self, steps: Steps, frame: bytes, step: Step) -> None:
+        """Publish what a step said, then measure it and write its receipt."""
+        for output in step.outputs:
+            self.port.publish(output)
+        now = time.monotonic_ns()
+        start, self._mark = self._mark, now
+        node = steps.name
+        topic = step.stream[0]
+        clock = self.clocks[node]
+        if topic == self._drivers[node]:
+            self.t = step.t
+            clock.tick(self.t0 + step.t, start, now)
+        probe = self._probes.get(node)
+        if probe is not None:
+            if topic == probe[1]:
+                went = self._probed.pop(step.t, None)
+                if went is not None:
+                    clock.latency.add((start - went) * 1e-3)
+            elif step.outputs and topic == self._drivers[node]:
+                if len(self._probed) > 4000:
+                    self._probed.clear()
+                self._probed[step.t] = now
+        for output in step.outputs:
+            self.sent[output[: output.find(b"\0")].decode()] += 1
+        book = self.books[node]
+        book.add(step)
+        if len(book) >= RECEIPT_BATCH:
+            self._publish_own(book.frame(step.t))
+        if topic == "run.event" and CODECS[topic].decode(frame).body.kind == "stop":
+            self.stopping = True
+
+    def _publish_own(self, frame: bytes) -> None:
+        self.port.publish(frame)
+        self.sent[frame[: frame.find(b"\0")].decode()] += 1
+
+    def _housekeep(self) -> None:
+        now = time.monotonic_ns()
+        if now - self._housekept < HOUSEKEEPING_NS:
+            return
+        self._housekept = now
+        self._flush(final=False)
+        steps = sum(s.steps for s in self.steppers.values())
+        self.control.say("beat", t=self.t, steps=steps, done=self._done)
+        if self._leave_at:
+            self.stopping |= now >= self._leave_at
+        elif os.getppid() != self._parent:
+            self._leave_at = now + PARTING_TICKS * TICK_NS
+            self._inject("stop", "supervisor gone")
+
+    def _flush(self, *, final: bool) -> None:
+        for book in self.books.values():
+            if len(book):
+                self._publish_own(book.frame(self.t))
+        now = time.monotonic_ns()
+        if final or now - self._reported > 1_000_000_000:
+            self._reported = now
+            for node in self.nodes:
+                self._publish_own(self._telemetry(node))
+
+    def _telemetry(self, node: str) -> bytes:
+        clock = self.clocks[node]
+        body = Telemetry(
+            steps=self.steppers[node].steps,
+            lateness_us=_quantiles(clock.lateness),
+            work_us=_quantiles(clock.work),
+            latency_us=_quantiles(clock.latency),
+            cpu_s=time.process_time(),
+        )
+        return self._own_frame("node.telemetry", node, body)
+
+    def _own_frame(self, topic: str, node: str, body: Any) -> bytes:
+        seq = self._own_seq[topic, node]
+        self._own_seq[topic, node] = seq + 1
+        return CODECS[topic].encode(node, 0, seq, self.t, body)
+
+    def _inject(self, kind: str, cause: str) -> None:
+        """Make a decision of the host an input of its nodes, recorded like any other."""
+        for node in self.nodes:
+            event = Event(tick=self.t // TICK_NS, kind=kind, node=node, cause=cause)
+            frame = self._own_frame("host.event", node, event)
+            self._publish_own(frame)
+            self._feed(frame)
+
+    def _fault(self, cause: str) -> None:
+        self.control.say("fault", cause=cause[:400])
+
+    def _wait_to_leave(self) -> None:
+        deadline = time.monotonic() + 15
+        while time.monotonic() < deadline and os.getppid() == self._parent:
+            order = self.control.hear(0.05)
+            if order and order["kind"] == "leave":
+                break
+        self.control.close()
+        self.port.close()
+        self.context.term()
+
+
+def rehearse(name: str, experiment: Experiment) -> None:
+    """Run a throw-away node through everything it will do, so that the real one is warm."""
+    node = build(name, experiment)
+    rehearsal = getattr(node, "rehearse", None)
+    if rehearsal is not None:
+        stepper = Stepper(name, node)
+        for frame in rehearsal():
+            stepper.step(frame)
+
+
+def counters(stepper: Stepper) -> dict[str, int]:
+    """What a node counted for the summary, if it counts anything."""
+    found: dict[str, int] = getattr(stepper.node, "counters", dict)()
+    return found
+
+
+def _quantiles(histogram: Histogram) -> np.ndarray[Any, np.dtype[np.float32]]:
+    summary = histogram.summary()
+    return np.array(list(summary.values()) or [0.0] * 4, np.float32)
+
+
+def main(name: str, layout: Layout) -> None:
+    """Entry point of a host process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Host(name, layout).run()

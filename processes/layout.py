@@ -1,0 +1,83 @@
+"""Who runs where in a live run: processes, the nodes they host, and their endpoints."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from vibrissa.messages.topics import TOPICS
+from vibrissa.processes.table import PROCESSES, PUBLISHED_BY_HOSTS
+
+SUPERVISOR_SAYS = ("run.event",)
+SUPERVISOR_HEARS = ("node.event",)
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """The processes of a run and their endpoints; every process reads the same one."""
+
+    hosts: dict[str, list[str]]
+    """process name -> nodes it hosts, in order."""
+    endpoints: dict[str, str]
+    """process name, "supervisor", "recorder" or "control" -> endpoint."""
+    experiment: str = field(repr=False)
+    """The experiment as JSON."""
+    log: str
+    """Path of the log the recorder writes."""
+    metadata: dict[str, str]
+    """What the log says about the run."""
+
+    def write(self, path: Path) -> None:
+        path.write_text(json.dumps(asdict(self)))
+
+    @staticmethod
+    def read(path: Path) -> Layout:
+        return Layout(**json.loads(path.read_text()))
+
+    def says(self, process: str) -> list[str]:
+        """Topics a process publishes."""
+        if process == "supervisor":
+            return list(SUPERVISOR_SAYS)
+        if process == "recorder":
+            return []
+        nodes = self.hosts[process]
+        return sorted({t for n in nodes for t in PROCESSES[n].says} | set(PUBLISHED_BY_HOSTS))
+
+    def hears(self, process: str) -> list[str]:
+        """Topics a process subscribes to at the others."""
+        if process == "supervisor":
+            return list(SUPERVISOR_HEARS)
+        if process == "recorder":
+            return [t.name for t in TOPICS.values() if t.recorded]
+        nodes = self.hosts[process]
+        wanted = {t for n in nodes for t in PROCESSES[n].hears}
+        return sorted(t for t in wanted if self.speakers(t) - {process})
+
+    def speakers(self, topic: str) -> set[str]:
+        """Processes that publish a topic; a host's own events reach its nodes directly."""
+        everyone = ["supervisor", *self.hosts]
+        if topic in PUBLISHED_BY_HOSTS:
+            return set()
+        return {p for p in everyone if topic in self.says(p)}
+
+    def connections(self, process: str) -> list[str]:
+        """Endpoints a process must connect to for what it hears."""
+        if process == "recorder":
+            names = ["supervisor", *self.hosts]
+        else:
+            wanted = {p for t in self.hears(process) for p in self.speakers(t)} - {process}
+            names = [p for p in ["supervisor", *self.hosts] if p in wanted]
+        return [self.endpoints[name] for name in names]
+
+    def audience(self, process: str) -> dict[str, int]:
+        """How many listeners each topic of a process must have before the run may start."""
+        listeners = [p for p in ("supervisor", "recorder", *self.hosts) if p != process]
+        endpoint = self.endpoints[process]
+        heard: dict[str, int] = {}
+        for other in listeners:
+            if endpoint in self.connections(other):
+                for topic in self.hears(other):
+                    if topic in self.says(process):
+                        heard[topic] = heard.get(topic, 0) + 1
+        return heard

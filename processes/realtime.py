@@ -1,0 +1,99 @@
+"""Real-time set-up of a host process, and what this machine grants of it.
+
+Measured on a 2-core virtual machine at 2 kHz: a timer slack of 1 ns cuts wake-up lateness from 63
+to 14 us for nothing; SCHED_FIFO cuts late cycles eightfold. Both must be set before the ZeroMQ
+context is made, whose threads inherit them. Without the privileges everything still runs, later now
+and then.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import gc
+import os
+import resource
+import signal
+import time
+from typing import Final
+
+_PR_SET_TIMERSLACK: Final = 29
+_PR_SET_PDEATHSIG: Final = 1
+_MCL_CURRENT_AND_FUTURE: Final = 3
+
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+def set_timer_slack() -> bool:
+    """Ask for 1 ns timer slack for this process and the threads it starts from now on."""
+    return _libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0) == 0
+
+
+def set_fifo(priority: int) -> bool:
+    """Run under SCHED_FIFO; False when the machine does not grant it."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except (OSError, AttributeError):
+        return False
+    return True
+
+
+def lock_memory() -> bool:
+    """Keep all pages in memory; False when the limit does not allow it."""
+    soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    if soft != resource.RLIM_INFINITY and os.geteuid() != 0:
+        return False  # a finite limit would make later allocations fail instead
+    return _libc.mlockall(_MCL_CURRENT_AND_FUTURE) == 0
+
+
+def die_with_parent() -> None:
+    """Have the kernel end this helper process when the one that started it is gone."""
+    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+
+
+def prepare(priority: int) -> list[str]:
+    """Set up a host process for its priority (0: ordinary). Returns what was not granted."""
+    missing = []
+    if not set_timer_slack():
+        missing.append("timer slack")
+    if priority:
+        if not set_fifo(priority):
+            missing.append("SCHED_FIFO")
+        if not lock_memory():
+            missing.append("memory locking")
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+    return missing
+
+
+def sleep_until(deadline_ns: int) -> None:
+    """Sleep to a deadline on the monotonic clock; returns at once when it has passed."""
+    left = deadline_ns - time.monotonic_ns()
+    if left > 0:
+        time.sleep(left * 1e-9)
+
+
+def privileges() -> dict[str, tuple[bool, str]]:
+    """What this machine grants: name -> (granted, what to do if not). Changes nothing for good."""
+    return {
+        "timer slack": (_in_child(set_timer_slack), "needs Linux with prctl"),
+        "SCHED_FIFO": (
+            _in_child(lambda: set_fifo(10)),
+            "add '@realtime - rtprio 95' to /etc/security/limits.conf and join that group",
+        ),
+        "memory locking": (
+            _in_child(lock_memory),
+            "add '@realtime - memlock unlimited' to /etc/security/limits.conf",
+        ),
+    }
+
+
+def _in_child(attempt) -> bool:  # type: ignore[no-untyped-def]
+    pid = os.fork()
+    if pid == 0:
+        granted = False
+        with contextlib.suppress(BaseException):
+            granted = bool(attempt())
+        os._exit(0 if granted else 1)
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0

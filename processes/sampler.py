@@ -1,0 +1,92 @@
+"""The sampler: owns the head device, runs the arbiter, applies exactly one command per tick."""
+
+from __future__ import annotations
+
+from vibrissa.control.arbiter import NO_TICK, RETRACT, Arbiter, ControllerId, Decision, Routing
+from vibrissa.control.kinematics import paper_head
+from vibrissa.messages.codec import Message
+from vibrissa.messages.types import Event, HeadCommand, HeadReading, HeadSample, WhiskCommand
+from vibrissa.processes.config import Experiment
+from vibrissa.processes.node import Output
+
+CONTROLLER = ControllerId("whisk")
+
+
+class SamplerNode:
+    """Turns readings into samples and routes one command per tick to the drives.
+
+    Until the operator's start, from the last half second of the run on, and whenever a stop or a
+    fault asks for it, the built-in retract controller has the drives.
+    """
+
+    def __init__(self, experiment: Experiment) -> None:
+        self._arbiter = Arbiter(paper_head().swing)
+        self._retract_tick = experiment.retract_tick
+        self._retracting = False
+        self._ticks = 0
+        self._answered = 0
+        self._late = 0
+
+    def step(self, message: Message) -> list[Output]:
+        body = message.body
+        match message.topic:
+            case "rig.sample":
+                return self._reading(body)
+            case "whisk.command":
+                return self._command(message.source, message.epoch, body)
+            case "run.event" if body.kind == "start":
+                return [_event(self._arbiter.route(CONTROLLER))]
+            case "run.event" | "host.event" if body.kind in ("retract", "stop"):
+                return self._start_retracting()
+        return []
+
+    def counters(self) -> dict[str, int]:
+        """Ticks seen, ticks whose command answered the sample before, commands that came late."""
+        return {"ticks": self._ticks, "answered": self._answered, "late": self._late}
+
+    def _reading(self, reading: HeadReading) -> list[Output]:
+        tick = reading.tick
+        outputs: list[Output] = []
+        if tick >= self._retract_tick:
+            outputs += self._start_retracting()
+        self._ticks += 1
+        self._answered += reading.answers == tick - 1
+        sample = HeadSample(
+            tick=tick,
+            answers=reading.answers,
+            theta=reading.theta,
+            x=reading.x,
+            y=reading.y,
+            command=self._arbiter.last_command,
+        )
+        outputs.append(("head.sample", sample))
+        return outputs + self._routed(tick, self._arbiter.on_sample(tick))
+
+    def _command(self, source: str, epoch: int, command: WhiskCommand) -> list[Output]:
+        controller = ControllerId(source, epoch)
+        routing = self._arbiter.on_command(controller, command.tick, command.command)
+        if routing.decision is not None and routing.decision.kind == "refused":
+            self._late += 1
+            return []  # a late command is counted; one event per late command would flood the log
+        return self._routed(command.tick, routing)
+
+    def _routed(self, tick: int, routing: Routing) -> list[Output]:
+        outputs: list[Output] = []
+        if routing.decision is not None:
+            outputs.append(_event(routing.decision))
+        if routing.command is not None:
+            name = self._arbiter.active.name
+            outputs.append(("head.command", HeadCommand(tick, name, routing.command)))
+        return outputs
+
+    def _start_retracting(self) -> list[Output]:
+        if self._retracting:
+            return []
+        self._retracting = True
+        return [_event(self._arbiter.route(RETRACT))]
+
+
+def _event(decision: Decision) -> Output:
+    tick = max(decision.tick, NO_TICK)
+    cause = f"{decision.controller}: {decision.cause}"
+    return "node.event", Event(tick, decision.kind, "sampler", cause[:400])

@@ -1,0 +1,399 @@
+"""The supervisor: starts the process table, holds the start barrier, watches, and ends runs in order.
+
+A run passes through these phases: warming (every process imports, compiles, rehearses, connects),
+running, and, whatever ended it, retracting (whiskers retract, the arm holds), stopping (every node
+takes the stop as its last input and hands in its receipts) and closing (the recorder writes out what
+was sent). Ctrl-C, a fault, a silent or a dead process all lead through the same end, which names the
+cause.
+"""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import zmq
+
+from vibrissa.messages.codec import CODECS, decode
+from vibrissa.messages.errors import MessageError
+from vibrissa.messages.transport import ZmqPort
+from vibrissa.messages.types import TICK_HZ, TICK_NS, Event
+from vibrissa.processes import provenance
+from vibrissa.processes.config import RETRACT_S, Experiment
+from vibrissa.processes.control import ControlDesk
+from vibrissa.processes.layout import Layout
+from vibrissa.processes.results import OnProgress, Progress, RunError, silent
+from vibrissa.processes.table import PROCESSES, RECORDER_SILENCE
+
+LEAD_S: Final = 0.25
+"""From the go to tick 0."""
+WARM_S: Final = 300.0
+BYE_S: Final = 5.0
+CLOSE_S: Final = 12.0
+POLL_S: Final = 0.02
+FATAL: Final = ("fault",)
+"""Kinds of node.event that end a run."""
+
+
+class Child:
+    """A process the supervisor started, and what it has said so far."""
+
+    def __init__(self, name: str, popen: subprocess.Popen[bytes], silence: float) -> None:
+        self.name = name
+        self.popen = popen
+        self.silence = silence
+        self.missing: list[str] = []
+        self.ready = False
+        self.heard = time.monotonic()
+        self.t = 0
+        self.steps = 0
+        self.done = False
+        self.bye: dict[str, Any] | None = None
+        self.closed: dict[str, Any] | None = None
+
+    def trouble(self, now: float) -> str | None:
+        """Why the run can't go on with this process, if so."""
+        code = self.popen.poll()
+        if code is not None and self.bye is None and self.closed is None:
+            how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+            return f"{self.name} ended unexpectedly ({how})"
+        if now - self.heard > self.silence:
+            return f"{self.name} has been silent for {self.silence:g} s"
+        return None
+
+
+class Supervisor:
+    """One live run, from the first process to the summary."""
+
+    def __init__(self, experiment: Experiment, out: Path, on_progress: OnProgress) -> None:
+        self.experiment = experiment
+        self.out = out
+        self.on_progress = on_progress
+        self.children: dict[str, Child] = {}
+        self.events: list[dict[str, Any]] = []
+        self.sent: collections.Counter[str] = collections.Counter()
+        self.cause: str | None = None
+        self._event_seq = 0
+        self._interrupted = 0
+        self.t0 = 0
+        self._cpu0 = 0.0
+        self._wall = 0.0
+
+    def run(self) -> dict[str, Any]:
+        """The whole run. Raises RunError when it can't start; otherwise always gives a summary."""
+        with self._folder() as folder, self._signals():
+            self.layout = self._layout(folder)
+            self.layout.write(folder / "layout.json")
+            context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+            try:
+                self._serve(context, folder)
+            finally:
+                self._kill_all()
+                context.destroy(linger=0)
+        summary = self._summary()
+        (self.out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
+        return summary
+
+    def _serve(self, context: zmq.Context[zmq.Socket[bytes]], folder: Path) -> None:
+        self.desk = ControlDesk(context, self.layout.endpoints["control"])
+        self.port = ZmqPort(
+            context,
+            self.layout.endpoints["supervisor"],
+            self.layout.hears("supervisor"),
+            self.layout.connections("supervisor"),
+        )
+        try:
+            for name in [*self.layout.hosts, "recorder"]:
+                self._start(name, folder)
+            self._warm()
+            self._go()
+            self._watch()
+            self._end()
+        finally:
+            self.port.close()
+            self.desk.close()
+
+    @contextlib.contextmanager
+    def _folder(self) -> Iterator[Path]:
+        try:
+            self.out.mkdir(parents=True)
+        except FileExistsError:
+            raise RunError(f"{self.out}: exists; a run never overwrites another") from None
+        except OSError as error:
+            raise RunError(f"{self.out}: {error.strerror}") from None
+        folder = Path(tempfile.mkdtemp(prefix="vibrissa-"))
+        try:
+            yield folder
+        except RunError:
+            with contextlib.suppress(OSError):
+                self.out.rmdir()  # nothing was recorded
+            raise
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    @contextlib.contextmanager
+    def _signals(self) -> Iterator[None]:
+        def interrupt(*_: object) -> None:
+            self._interrupted += 1
+
+        with contextlib.ExitStack() as stack:
+            for number in (signal.SIGINT, signal.SIGTERM):
+                with contextlib.suppress(ValueError):  # not the main thread: nothing to catch
+                    stack.callback(signal.signal, number, signal.signal(number, interrupt))
+            yield
+
+    def _layout(self, folder: Path) -> Layout:
+        run = self.experiment.run
+        together = {n: "+".join(group) for group in run.together for n in group}
+        hosts: dict[str, list[str]] = {}
+        for name in PROCESSES:
+            hosts.setdefault(together.get(name, name), [])
+        for host in hosts:
+            hosts[host] = host.split("+")
+        names = ["control", "supervisor", "recorder", *hosts]
+        if run.transport == "tcp":
+            endpoints = {n: f"tcp://127.0.0.1:{run.tcp_port + i}" for i, n in enumerate(names)}
+            for name, endpoint in endpoints.items():
+                _check_free(name, int(endpoint.rpartition(":")[2]))
+        else:
+            endpoints = {n: f"ipc://{folder}/{n}" for n in names}
+        text = self.experiment.model_dump_json()
+        meta = provenance.metadata(text, "live")
+        meta["run_id"] = f"{meta['config_hash'][:12]}-{time.time_ns():x}"
+        return Layout(hosts, endpoints, text, str(self.out.absolute() / "run.mcap"), meta)
+
+    def _start(self, name: str, folder: Path) -> None:
+        environment = os.environ | {
+            "OPENBLAS_NUM_THREADS": "1",
+            "OMP_NUM_THREADS": "1",
+            "NUMBA_NUM_THREADS": "1",
+        }
+        command = [sys.executable, "-m", "vibrissa.processes.main", name, str(folder)]
+        popen = subprocess.Popen(command, env=environment, start_new_session=True)
+        nodes = self.layout.hosts.get(name)
+        silence = (
+            min(PROCESSES[n].silence for n in nodes) if nodes is not None else RECORDER_SILENCE
+        )
+        self.children[name] = Child(name, popen, silence)
+
+    def _warm(self) -> None:
+        """Wait until everybody is warm, connected and heard by everybody they talk to."""
+        deadline = time.monotonic() + WARM_S
+        wanted = self.layout.audience("supervisor")
+        while True:
+            self._listen()
+            ready = [c.name for c in self.children.values() if c.ready]
+            self._report("warming up", 0.0, f"{len(ready)} of {len(self.children)} ready")
+            heard = self.port.subscribers()
+            if len(ready) == len(self.children) and all(
+                heard.get(topic, 0) >= n for topic, n in wanted.items()
+            ):
+                return
+            for child in self.children.values():
+                if child.popen.poll() is not None:
+                    raise RunError(f"{child.name} could not start (see above)")
+            if self.cause or self._interrupted:
+                raise RunError(self.cause or "interrupted before the run started")
+            if time.monotonic() > deadline:
+                late = ", ".join(n for n in self.children if n not in ready)
+                raise RunError(f"not ready after {WARM_S:g} s: {late}")
+
+    def _go(self) -> None:
+        self.t0 = time.monotonic_ns() + int(LEAD_S * 1e9)
+        self._wall = time.monotonic()
+        self._cpu0 = time.process_time()
+        for child in self.children.values():
+            child.heard = time.monotonic()
+            if child.name != "recorder":
+                self.desk.say(child.name, "go", t0_ns=self.t0)
+        missing = sorted({m for c in self.children.values() for m in c.missing})
+        if missing:
+            self._note(0, "degraded", "supervisor", f"not granted: {', '.join(missing)}")
+        self._decide("start", "operator started the run")
+
+    def _watch(self) -> None:
+        """Until the run is complete or something ends it."""
+        while self.cause is None:
+            self._listen()
+            self._report("running", self._tick() / TICK_HZ)
+            now = time.monotonic()
+            for child in self.children.values():
+                self.cause = self.cause or child.trouble(now)
+            if self._interrupted:
+                self.cause = "interrupted by the operator"
+            drivers = [c for c in self.children.values() if c.done]
+            if self.cause is None and drivers:
+                self.cause = "completed"
+                time.sleep(0.05)
+
+    def _end(self) -> None:
+        """Retract, stop, close; what is dead or silent is not waited for."""
+        if self.cause != "completed":
+            self._decide("retract", str(self.cause))
+            self._until(RETRACT_S, "retracting", lambda: False)
+        self._decide("stop", str(self.cause))
+        hosts = [c for n, c in self.children.items() if n != "recorder"]
+        self._until(BYE_S, "stopping", lambda: all(c.bye or _dead(c) for c in hosts))
+        recorder = self.children["recorder"]
+        for child in hosts:
+            if child.bye:
+                self.sent.update(child.bye["sent"])
+        self.desk.say("recorder", "finish", sent=dict(self.sent))
+        self._until(CLOSE_S, "closing the log", lambda: bool(recorder.closed) or _dead(recorder))
+        for child in hosts:
+            self.desk.say(child.name, "leave")
+        self._until(1.0, "leaving", lambda: all(_dead(c) for c in self.children.values()))
+        self._wall = time.monotonic() - self._wall
+
+    def _until(self, seconds: float, phase: str, done: Any) -> None:
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline and not done():
+            self._listen()
+            self._report(phase, self._tick() / TICK_HZ)
+
+    def _listen(self) -> None:
+        """Take everything that was said on the control channel and the bus."""
+        wait = POLL_S
+        while True:
+            try:
+                heard = self.desk.hear(wait)
+            except MessageError as error:
+                self._note(self._tick(), "refused", "control", str(error))
+                continue
+            if heard is None:
+                break
+            wait = 0.0
+            self._take(*heard)
+        while (frame := self.port.receive(0)) is not None:
+            try:
+                message = decode(frame)
+            except MessageError as error:
+                self._note(self._tick(), "refused", "supervisor", str(error))
+                continue
+            event: Event = message.body
+            self._note(event.tick, event.kind, event.node, event.cause)
+            if event.kind in FATAL:
+                self.cause = self.cause or f"{event.node}: {event.cause}"
+
+    def _take(self, name: str, message: dict[str, Any]) -> None:
+        child = self.children.get(name)
+        if child is None:
+            self._note(self._tick(), "refused", "control", f"a stranger calls itself {name[:40]!r}")
+            return
+        child.heard = time.monotonic()
+        match message["kind"]:
+            case "hello":
+                child.missing = message["missing"]
+            case "ready":
+                child.ready = True
+            case "beat":
+                child.t, child.steps, child.done = message["t"], message["steps"], message["done"]
+            case "fault":
+                self.cause = self.cause or f"{name}: {message['cause']}"
+            case "bye":
+                child.bye = message
+            case "closed":
+                child.closed = message
+
+    def _decide(self, kind: str, cause: str) -> None:
+        """Put a decision on the bus, where every node takes it as an input and it is recorded."""
+        tick = max(self._tick(), 0)
+        event = Event(tick=tick, kind=kind, node="supervisor", cause=cause[:400])
+        frame = CODECS["run.event"].encode("supervisor", 0, self._event_seq, tick * TICK_NS, event)
+        self._event_seq += 1
+        self.port.publish(frame)
+        self.sent["run.event"] += 1
+        self._note(tick, kind, "supervisor", cause)
+
+    def _note(self, tick: int, kind: str, node: str, cause: str) -> None:
+        if len(self.events) < 10_000:
+            self.events.append({"tick": tick, "kind": kind, "node": node, "cause": cause})
+
+    def _tick(self) -> int:
+        if not self.t0:
+            return 0
+        tick = (time.monotonic_ns() - self.t0) // TICK_NS
+        return min(max(tick, 0), self.experiment.ticks)
+
+    def _report(self, phase: str, done: float, note: str = "") -> None:
+        self.on_progress(Progress(phase, done, self.experiment.run.duration, note))
+
+    def _kill_all(self) -> None:
+        for child in self.children.values():
+            if child.popen.poll() is None:
+                child.popen.kill()
+            child.popen.wait()
+
+    def _summary(self) -> dict[str, Any]:
+        byes = [c.bye for c in self.children.values() if c.bye]
+        stats = {node: s for bye in byes for node, s in bye["stats"].items()}
+        counters = {node: c for bye in byes for node, c in bye["counters"].items()}
+        closed = self.children["recorder"].closed
+        received = closed["received"] if closed else {}
+        messages = {
+            topic: {
+                "sent": n,
+                "received": received.get(topic, 0),
+                "lost": max(n - received.get(topic, 0), 0),
+            }
+            for topic, n in sorted(self.sent.items())
+        }
+        cpu = sum(bye["cpu_s"] for bye in byes) + (closed["cpu_s"] if closed else 0.0)
+        cpu += time.process_time() - self._cpu0
+        sampler = counters.get("sampler", {})
+        lost = sum(m["lost"] for m in messages.values())
+        return {
+            "ok": self.cause == "completed" and lost == 0,
+            "cause": self.cause,
+            "ticks": sampler.get("ticks", 0),
+            "ticks_answered": sampler.get("answered", 0),
+            "cycles": counters.get("whisk", {}).get("cycles", 0),
+            "messages": messages,
+            **{
+                key: {node: s[key] for node, s in stats.items() if s[key]}
+                for key in ("latency_us", "lateness_us", "work_us", "period_us")
+            },
+            "cpu_cores": round(cpu / max(self._wall, 1e-9), 3),
+            "steps": {name: child.steps for name, child in self.children.items()},
+            "counters": counters,
+            "events": self.events,
+            "log": self.layout.log,
+            "run_id": self.layout.metadata["run_id"],
+            "seed": self.experiment.run.seed,
+        }
+
+
+def run_live(experiment: Experiment, out: Path, on_progress: OnProgress = silent) -> dict[str, Any]:
+    """Run an experiment live; write out/run.mcap and out/summary.json; return the summary.
+
+    Raises RunError when the run can't start: the directory exists, a port is in use, a process
+    does not come up. Once it runs it always ends in order, and the summary names the cause.
+    """
+    return Supervisor(experiment, out, on_progress).run()
+
+
+def _dead(child: Child) -> bool:
+    return child.popen.poll() is not None
+
+
+def _check_free(name: str, port: int) -> None:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError as error:
+            raise RunError(
+                f"run.tcp_port: port {port} (for {name}) can't be used: {error.strerror}"
+            ) from None

@@ -1,0 +1,328 @@
+"""Verify: re-run every node of a log from its receipts and compare all outputs byte for byte.
+
+Each node gets the recorded messages it consumed, in the order of its receipts. Its outputs must be
+the recorded ones, and the running digest in every receipt must come out the same. As every node
+is fed what was recorded, a difference stays where it arose, and if no node differs the whole run is
+identical by induction. The log is read as a stream: memory does not grow with its length.
+"""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import dataclasses
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from vibrissa.messages.codec import decode, header
+from vibrissa.messages.errors import MessageError
+from vibrissa.messages.log_format import LogError
+from vibrissa.messages.log_reader import LogReader
+from vibrissa.messages.topics import TOPICS
+from vibrissa.processes import provenance
+from vibrissa.processes.config import Experiment
+from vibrissa.processes.framelog import frame_of
+from vibrissa.processes.lockstep import LocalRunner, RemoteRunner, workers
+from vibrissa.processes.node import timer_frame
+from vibrissa.processes.rebuild import (
+    Replacements,
+    check_replacements,
+    experiment_of,
+    make_stepper,
+    open_log,
+)
+from vibrissa.processes.receipts import Entry, Stream, entries
+from vibrissa.processes.results import (
+    Difference,
+    Executor,
+    OnProgress,
+    Progress,
+    UnusableLogError,
+    Verdict,
+    silent,
+)
+from vibrissa.processes.table import PROCESSES
+
+PUMP_RECORDS: Final = 4000
+AFTERMATH_NS: Final = 500_000_000
+"""How far to read on after a difference, so that its cause is found before its consequences."""
+
+
+@dataclasses.dataclass(slots=True)
+class Finding:
+    """A difference, the message that differs and the message whose consumption showed it."""
+
+    difference: Difference
+    t: int
+    output: tuple[Stream, int] | None
+    consumed: tuple[Stream, int]
+
+
+class NodeCheck:
+    """The re-run of one node against its receipts and recorded outputs."""
+
+    def __init__(self, runner: LocalRunner | RemoteRunner) -> None:
+        self.name = runner.name
+        self._runner = runner
+        self._entries: collections.deque[Entry] = collections.deque()
+        self._inbox: dict[Stream, dict[int, bytes]] = collections.defaultdict(dict)
+        self._expected: dict[str, collections.deque[bytes]] = collections.defaultdict(
+            collections.deque
+        )
+        self._batch: list[Entry] = []
+        self._frames: list[bytes] = []
+        self._next_step = 0
+        self.steps = 0
+        self.messages = 0
+        self.bytes = 0
+        self.finding: Finding | None = None
+
+    def add_receipts(self, frame: bytes) -> None:
+        """Raises UnusableLogError when receipts are missing or contradict themselves."""
+        try:
+            found = list(entries(decode(frame)))
+        except ValueError as error:
+            raise UnusableLogError(f"a receipt of {self.name} can't be read: {error}") from None
+        if found and found[0].step != self._next_step:
+            raise UnusableLogError(
+                f"receipts of {self.name} are missing: expected step {self._next_step}, "
+                f"found {found[0].step}"
+            )
+        self._next_step += len(found)
+        if self.finding is None:
+            self._entries.extend(found)
+
+    def add_input(self, stream: Stream, seq: int, frame: bytes) -> None:
+        if self.finding is None:
+            self._inbox[stream][seq] = frame
+
+    def add_output(self, topic: str, frame: bytes) -> None:
+        if self.finding is None:
+            self._expected[topic].append(frame)
+
+    def submit(self) -> None:
+        """Hand every step whose input is there to the runner."""
+        while self._entries and self.finding is None:
+            entry = self._entries[0]
+            topic, source, epoch = entry.stream
+            if topic == "host.timer" and source == self.name and epoch == 0:
+                frame = timer_frame(self.name, entry.seq)
+            else:
+                found = self._inbox[entry.stream].pop(entry.seq, None)
+                if found is None:
+                    break
+                frame = found
+            self._batch.append(self._entries.popleft())
+            self._frames.append(frame)
+        self._runner.submit(self._frames)
+
+    def collect(self) -> None:
+        """Compare what came out with what was recorded."""
+        results = self._runner.collect()
+        for entry, frame, (digest, outputs) in zip(self._batch, self._frames, results, strict=True):
+            self.finding = self._compare(entry, frame, digest, outputs)
+            if self.finding is not None:
+                break
+            self.steps += 1
+        self._batch.clear()
+        self._frames = []
+
+    def leftovers(self) -> str | None:
+        """What a complete log should not leave: a receipt without its message, or the reverse."""
+        if self.finding is not None:
+            return None
+        if self._entries:
+            entry = self._entries[0]
+            topic, source, epoch = entry.stream
+            return (
+                f"{self.name}, step {entry.step}: consumed {topic} #{entry.seq} of {source} "
+                f"(epoch {epoch}), which is not in the log"
+            )
+        for topic, frames in self._expected.items():
+            if frames:
+                seq = header(frames[0])[3]
+                return f"{self.name}: no receipt accounts for its {topic} #{seq}"
+        return None
+
+    def _compare(
+        self, entry: Entry, frame: bytes, digest: int, outputs: Sequence[bytes]
+    ) -> Finding | None:
+        consumed = (entry.stream, entry.seq)
+        t = header(frame)[4]
+        for output in outputs:
+            topic, source, epoch, seq, _ = header(output)
+            if not TOPICS[topic].recorded:
+                continue
+            expected = self._expected[topic]
+            recorded = expected.popleft() if expected else None
+            if recorded != output:
+                field, then, now = differing_field(recorded, output)
+                difference = Difference(self.name, entry.step, topic, field, then, now, t * 1e-9)
+                return Finding(difference, t, ((topic, source, epoch), seq), consumed)
+            self.messages += 1
+            self.bytes += len(output)
+        if digest != entry.digest:
+            difference = Difference(
+                self.name,
+                entry.step,
+                entry.stream[0],
+                "receipt",
+                f"digest {entry.digest:08x}",
+                f"digest {digest:08x} (the order of receipts or an input was altered)",
+                t * 1e-9,
+            )
+            return Finding(difference, t, None, consumed)
+        return None
+
+
+def differing_field(recorded: bytes | None, recomputed: bytes) -> tuple[str, str, str]:
+    """(field, recorded value, recomputed value) of the first field that differs."""
+    now = decode(recomputed)
+    if recorded is None:
+        return "message", "no message", f"#{now.seq}"
+    try:
+        then = decode(recorded)
+    except MessageError as error:
+        return "message", f"unreadable ({error})", f"#{now.seq}"
+    for name in ("source", "epoch", "seq", "t"):
+        if getattr(then, name) != getattr(now, name):
+            return name, str(getattr(then, name)), str(getattr(now, name))
+    for field in dataclasses.fields(now.body):
+        a, b = getattr(then.body, field.name), getattr(now.body, field.name)
+        if isinstance(b, np.ndarray):
+            if a.tobytes() != b.tobytes():
+                return _differing_element(field.name, a, b)
+        elif repr(a) != repr(b):
+            return field.name, repr(a), repr(b)
+    return "encoding", f"{len(recorded)} bytes", f"{len(recomputed)} bytes"
+
+
+def _differing_element(name: str, a: Any, b: Any) -> tuple[str, str, str]:
+    if a.shape != b.shape:
+        return name, f"shape {a.shape}", f"shape {b.shape}"
+    width = a.dtype.itemsize
+    one = np.frombuffer(a.tobytes(), np.uint8).reshape(-1, width)
+    two = np.frombuffer(b.tobytes(), np.uint8).reshape(-1, width)
+    index = int(np.flatnonzero((one != two).any(axis=1))[0])
+    return f"{name}[{index}]", repr(a.reshape(-1)[index].item()), repr(b.reshape(-1)[index].item())
+
+
+def verify(
+    path: Path,
+    executor: Executor = "fused",
+    on_progress: OnProgress = silent,
+    replacements: Replacements | None = None,
+) -> Verdict:
+    """Re-run a log and compare. Raises UnusableLogError when it can't be re-run at all."""
+    replacements = replacements or {}
+    check_replacements(replacements)
+    reader = open_log(path, allow_cut=True)
+    experiment = experiment_of(reader)
+    made_with = reader.metadata.get("replacements", "")
+    if made_with and not replacements:
+        raise UnusableLogError(
+            f"{path}: a what-if run with {made_with}; name the same with --replace to verify it"
+        )
+    names = reader.metadata.get("nodes", ",".join(PROCESSES)).split(",")
+    notes = provenance.mismatches(reader.metadata)
+    with _runners(executor, names, experiment, replacements) as runners:
+        return _verify(reader, experiment, executor, runners, notes, on_progress)
+
+
+@contextlib.contextmanager
+def _runners(
+    executor: Executor, names: Sequence[str], experiment: Experiment, replacements: Replacements
+) -> Iterator[Sequence[LocalRunner | RemoteRunner]]:
+    if executor == "lockstep":
+        with workers(names, experiment, replacements) as remote:
+            yield list(remote.values())
+    else:
+        yield [LocalRunner(make_stepper(n, experiment, replacements)) for n in names]
+
+
+def _verify(
+    reader: LogReader,
+    experiment: Experiment,
+    executor: Executor,
+    runners: Sequence[LocalRunner | RemoteRunner],
+    notes: list[str],
+    on_progress: OnProgress,
+) -> Verdict:
+    checks = {r.name: NodeCheck(r) for r in runners}
+    began = time.monotonic()
+    t, stop_at = 0, None
+    try:
+        for count, record in enumerate(reader):
+            _route(frame_of(record), record.topic, record.source, record.seq, checks)
+            t = max(t, record.t)
+            if count % PUMP_RECORDS == 0:
+                _pump(checks)
+                on_progress(Progress(f"{executor} re-run", t * 1e-9, experiment.run.duration))
+                if stop_at is None and any(c.finding for c in checks.values()):
+                    stop_at = t + AFTERMATH_NS
+                if stop_at is not None and t > stop_at:
+                    break
+        _pump(checks)
+    except LogError as error:
+        raise UnusableLogError(str(error)) from None
+    except MessageError as error:
+        raise UnusableLogError(f"{reader.path}: a message can't be replayed: {error}") from None
+    elapsed = time.monotonic() - began
+    first = first_cause([c.finding for c in checks.values() if c.finding is not None])
+    complete = reader.complete is not False and "recovered" not in reader.extra
+    if first is None:
+        lacking = [why for c in checks.values() if (why := c.leftovers())]
+        if lacking and complete:
+            raise UnusableLogError(f"{reader.path}: {lacking[0]}")
+        if not any(c.steps for c in checks.values()):
+            raise UnusableLogError(f"{reader.path}: it has no receipts, so nothing can be re-run")
+        if not complete:
+            ends = ", ".join(f"{c.name} {c.steps}" for c in checks.values())
+            notes.append(f"the log is cut off; verified to its last complete steps: {ends}")
+    return Verdict(
+        identical=first is None,
+        executor=executor,
+        steps=sum(c.steps for c in checks.values()),
+        compared_bytes=sum(c.bytes for c in checks.values()),
+        compared_messages=sum(c.messages for c in checks.values()),
+        duration_s=t * 1e-9,
+        realtime_factor=round(t * 1e-9 / max(elapsed, 1e-9), 2),
+        first_difference=first,
+        notes=tuple(notes),
+    )
+
+
+def first_cause(findings: Sequence[Finding]) -> Difference | None:
+    """The earliest difference that is not merely the consequence of consuming another one."""
+    altered = {f.output for f in findings if f.output is not None}
+    roots = [f for f in findings if f.consumed not in altered] or list(findings)
+    return min(roots, key=lambda f: f.t).difference if roots else None
+
+
+def _route(frame: bytes, topic: str, source: str, seq: int, checks: dict[str, NodeCheck]) -> None:
+    producer = checks.get(source)
+    if topic == "node.receipt":
+        if producer is not None:
+            producer.add_receipts(frame)
+        return
+    row = TOPICS.get(topic)
+    if row is None or topic == "node.telemetry":
+        return
+    if producer is not None and row.compared:
+        producer.add_output(topic, frame)
+    stream = None
+    for name, check in checks.items():
+        if topic in PROCESSES[name].hears and (topic != "host.event" or name == source):
+            stream = stream or (topic, source, header(frame)[2])
+            check.add_input(stream, seq, frame)
+
+
+def _pump(checks: dict[str, NodeCheck]) -> None:
+    for check in checks.values():
+        check.submit()
+    for check in checks.values():
+        check.collect()

@@ -1,0 +1,396 @@
+"""The simulated devices: the whisker head and the arm that carries it.
+
+Both are plain objects stepped by whoever holds the clock. They read no time of their own: tick
+numbers come in, samples and poses go out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vibrissa.control.kinematics import WHISKERS, HeadGeometry, paper_head, ring_of
+from vibrissa.numerics import cos, sin
+from vibrissa.rig import head as h
+from vibrissa.rig.scene import Scene, build_scene
+from vibrissa.rig.whisker import SHAFT_ROWS, second_order_step, shaft_table
+
+Float32s = NDArray[np.float32]
+Float64s = NDArray[np.float64]
+Pose = tuple[float, float, float, float]
+
+WATCHDOG_TICKS = 40
+ARM_PERIOD = 16  # ticks, 125 Hz
+ARM_SECONDS = ARM_PERIOD * h.TICK
+
+
+class PlantError(ValueError):
+    """A parameter or an input that the plant refuses; nothing has changed."""
+
+
+def _check_range(where: str, name: str, value: float, low: float, high: float, unit: str) -> None:
+    if not low <= value <= high:
+        raise PlantError(f"{where}.{name}: expected {low} to {high} {unit}, found {value}")
+
+
+@dataclass(frozen=True)
+class HeadPlantParams:
+    """What the simulated head is made of. Three-tuples are (front, mid, rear ring).
+
+    Raises PlantError for a value outside the range given here.
+
+    shaft_base_diameter  m, 0.1e-3 to 10e-3
+    shaft_tip_diameter   m, at least 0.1 of the base, at most the base
+    shaft_modulus        Pa, 1e8 to 1e12, Young's modulus
+    shaft_density        kg/m^3, 100 to 20000
+    shaft_damping        damping ratio of the first mode, 0.01 to 0.99
+    servo_frequency      Hz, 0.5 to 200, natural frequency of the position servo
+    servo_damping        damping ratio of the servo, 0.1 to 10
+    servo_stiffness      N m/rad, 1e-3 to 1e3, static: a moment M moves the servo by M / Kp
+    servo_speed          rad/s, 0.1 to 1000, speed limit
+    stop_margin          rad, 0 to 0.5, mechanical stops lie this far outside [0, swing]
+    retract_speed        rad/s, 0.01 to 100, speed of the watchdog's retraction
+    encoder_noise        rad, 0 to 0.1, standard deviation
+    sensor_noise         N m, 0 to 1e-2, standard deviation
+    sensor_drift         N m/sqrt(s), 0 to 1e-2, random walk of the bias
+    sensor_cross_talk    0 to 0.5, share of x seen in y and of y in x
+    sensor_full_scale    N m, 1e-5 to 10, readings are clipped here
+    sensor_resolution    N m per count, 0 to 1e-3, 0 for none
+    """
+
+    geometry: HeadGeometry = field(default_factory=paper_head)
+    shaft_base_diameter: tuple[float, float, float] = (0.8e-3, 1.3e-3, 1.6e-3)
+    shaft_tip_diameter: tuple[float, float, float] = (0.3e-3, 0.4e-3, 0.4e-3)
+    shaft_modulus: float = 3e9
+    shaft_density: float = 1200.0
+    shaft_damping: float = 0.15
+    servo_frequency: float = 10.0
+    servo_damping: float = 1.0
+    servo_stiffness: float = 0.3
+    servo_speed: float = 20.0
+    stop_margin: float = 0.087
+    retract_speed: float = 2.0
+    encoder_noise: float = math.radians(0.1)
+    sensor_noise: float = 1e-5
+    sensor_drift: float = 0.0
+    sensor_cross_talk: float = 0.0
+    sensor_full_scale: float = 0.03
+    sensor_resolution: float = 1e-6
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "shaft_modulus": (1e8, 1e12, "Pa"),
+            "shaft_density": (100.0, 20000.0, "kg/m^3"),
+            "shaft_damping": (0.01, 0.99, ""),
+            "servo_frequency": (0.5, 200.0, "Hz"),
+            "servo_damping": (0.1, 10.0, ""),
+            "servo_stiffness": (1e-3, 1e3, "N m/rad"),
+            "servo_speed": (0.1, 1000.0, "rad/s"),
+            "stop_margin": (0.0, 0.5, "rad"),
+            "retract_speed": (0.01, 100.0, "rad/s"),
+            "encoder_noise": (0.0, 0.1, "rad"),
+            "sensor_noise": (0.0, 1e-2, "N m"),
+            "sensor_drift": (0.0, 1e-2, "N m/sqrt(s)"),
+            "sensor_cross_talk": (0.0, 0.5, ""),
+            "sensor_full_scale": (1e-5, 10.0, "N m"),
+            "sensor_resolution": (0.0, 1e-3, "N m"),
+        }
+        for name, (low, high, unit) in ranges.items():
+            _check_range("head plant", name, getattr(self, name), low, high, unit)
+        for name in ("shaft_base_diameter", "shaft_tip_diameter"):
+            if len(getattr(self, name)) != 3:
+                raise PlantError(
+                    f"head plant.{name}: expected 3 values (front, mid, rear), "
+                    f"found {len(getattr(self, name))}"
+                )
+        for base, tip in zip(self.shaft_base_diameter, self.shaft_tip_diameter, strict=True):
+            _check_range("head plant", "shaft_base_diameter", base, 0.1e-3, 10e-3, "m")
+            _check_range("head plant", "shaft_tip_diameter", tip, 0.1 * base, base, "m")
+
+
+def head_table(params: HeadPlantParams) -> Float64s:
+    """The parameters as ``head_step`` reads them, float64[HEAD_ROWS, 18]."""
+    g = params.geometry
+    rings = [ring_of(i) for i in range(WHISKERS)]
+    table = np.empty((h.HEAD_ROWS, WHISKERS), dtype=np.float64)
+    table[:SHAFT_ROWS] = shaft_table(
+        g.length,
+        np.array([params.shaft_base_diameter[r] for r in rings]),
+        np.array([params.shaft_tip_diameter[r] for r in rings]),
+        params.shaft_modulus,
+        params.shaft_density,
+        params.shaft_damping,
+        h.TICK,
+    )
+    table[h.PIVOT_RADIUS] = g.pivot_radius
+    table[h.PIVOT_HEIGHT] = g.pivot_height
+    table[h.AZIMUTH_COS] = [cos(a) for a in g.azimuth]
+    table[h.AZIMUTH_SIN] = [sin(a) for a in g.azimuth]
+    table[h.PHI_START] = g.phi_start
+    table[h.THETA_LOW] = -params.stop_margin
+    table[h.THETA_HIGH] = g.swing + params.stop_margin
+    servo = second_order_step(
+        2 * math.pi * params.servo_frequency, params.servo_damping, h.TICK
+    )
+    table[h.SERVO_EE : h.SERVO_WW + 1] = np.array(servo)[:, None]
+    table[h.COMPLIANCE] = 1.0 / params.servo_stiffness
+    table[h.SPEED_LIMIT] = params.servo_speed
+    table[h.RETRACT_STEP] = params.retract_speed * h.TICK
+    table[h.ENCODER_NOISE] = params.encoder_noise
+    table[h.SENSOR_NOISE] = params.sensor_noise
+    table[h.DRIFT_STEP] = params.sensor_drift * math.sqrt(h.DRIFT_TICKS * h.TICK)
+    table[h.CROSS_TALK] = params.sensor_cross_talk
+    table[h.FULL_SCALE] = params.sensor_full_scale
+    table[h.RESOLUTION] = params.sensor_resolution
+    return table
+
+
+def rest_state(params: HeadPlantParams) -> Float64s:
+    """State float64[STATE_ROWS, 18] of a head at rest at theta = 0, touching nothing."""
+    state = np.zeros((h.STATE_ROWS, WHISKERS), dtype=np.float64)
+    state[h.PSI] = params.geometry.phi_start
+    state[h.PEG] = -1
+    state[h.SIDE_BOX] = -1
+    return state
+
+
+class HeadPlant:
+    """The head over a maze: eighteen servos, whiskers and sensors at 2 kHz.
+
+    ``boxes`` float64[n, 5] as made by ``wall_boxes``, m; ``seed`` of the noise, 0 to 2^63 - 1.
+    With ``skip`` off every whisker looks at every box; the samples are the same to the bit.
+    As in the firmware, when no command has come for 40 ticks (20 ms) the drives go back to
+    theta = 0 by themselves, at ``retract_speed``.
+    """
+
+    def __init__(
+        self, boxes: Float64s, seed: int, params: HeadPlantParams | None = None, skip: bool = True
+    ) -> None:
+        if not 0 <= seed < 2**63:
+            raise PlantError(f"head plant seed: expected 0 to 2^63 - 1, found {seed}")
+        self.params = params or HeadPlantParams()
+        self.scene: Scene = build_scene(boxes, float(self.params.geometry.length.max()))
+        self.seed = seed
+        self.skip = skip
+        self.state = rest_state(self.params)
+        self._table = head_table(self.params)
+        self._pose = np.zeros(4, dtype=np.float64)
+        self._command = np.zeros(WHISKERS, dtype=np.float32)
+        self._last_command_tick: int | None = None
+        self._last_tick: int | None = None
+
+    def step(
+        self, tick: int, pose: Pose, command: Float32s | None
+    ) -> tuple[Float32s, Float32s, Float32s]:
+        """Advance by one tick and sample: (theta rad, x N m, y N m), new arrays float32[18].
+
+        pose: head (x, y, z, yaw), m and rad; command: theta set-points float32[18], rad, or None
+        when none came in this tick (the drives follow the last one until the watchdog fires).
+        Raises PlantError when ticks don't follow one another, or for a command or pose that is
+        not finite, of the wrong shape or out of range.
+        """
+        if self._last_tick is not None and tick != self._last_tick + 1:
+            raise PlantError(f"head plant tick: expected {self._last_tick + 1}, found {tick}")
+        last_command_tick = self._last_command_tick
+        if command is not None:
+            if command.shape != (WHISKERS,) or command.dtype != np.float32:
+                raise PlantError(
+                    f"head plant command: expected float32[{WHISKERS}], "
+                    f"found {command.dtype}{list(command.shape)}"
+                )
+            last_command_tick = tick
+        silent = last_command_tick is None or tick - last_command_tick >= WATCHDOG_TICKS
+        self._pose[:] = pose
+        theta = np.empty(WHISKERS, dtype=np.float32)
+        x = np.empty(WHISKERS, dtype=np.float32)
+        y = np.empty(WHISKERS, dtype=np.float32)
+        scene = self.scene
+        status = h.head_step(
+            self.state,
+            self._table,
+            scene.boxes,
+            scene.grid,
+            scene.starts,
+            scene.items,
+            self.skip,
+            self.seed,
+            tick,
+            self._pose,
+            self._command if command is None else command,
+            silent,
+            theta,
+            x,
+            y,
+        )
+        if status == h.COMMAND_NOT_FINITE:
+            assert command is not None
+            i = int(np.flatnonzero(~np.isfinite(command))[0])
+            raise PlantError(
+                f"head plant command, tick {tick}, whisker {i}: expected a finite angle, "
+                f"found {command[i]}"
+            )
+        if status == h.POSE_OUT_OF_RANGE:
+            raise PlantError(
+                f"head plant pose, tick {tick}: expected 4 numbers within "
+                f"+-{h.POSE_LIMIT:g}, found {tuple(float(v) for v in pose)}"
+            )
+        if command is not None:
+            self._command[:] = command
+        self._last_command_tick, self._last_tick = last_command_tick, tick
+        return theta, x, y
+
+
+@dataclass(frozen=True)
+class ArmPlantParams:
+    """Limits of the simulated arm. Raises PlantError for a value outside its range.
+
+    speed              m/s, 0.001 to 5, of the head
+    acceleration       m/s^2, 0.01 to 100
+    turn_speed         rad/s, 0.01 to 20
+    turn_acceleration  rad/s^2, 0.01 to 500
+    """
+
+    speed: float = 0.5
+    acceleration: float = 2.0
+    turn_speed: float = 1.5
+    turn_acceleration: float = 6.0
+
+    def __post_init__(self) -> None:
+        tops = {"speed": 5.0, "acceleration": 100.0, "turn_speed": 20.0, "turn_acceleration": 500.0}
+        for entry in fields(self):
+            low = 0.001 if entry.name == "speed" else 0.01
+            _check_range(
+                "arm plant", entry.name, getattr(self, entry.name), low, tops[entry.name], "(SI)"
+            )
+
+
+class ArmPlant:
+    """The arm: carries the head to set-points that come at 125 Hz, one period (8 ms) later.
+
+    A set-point that speed and acceleration allow is reached exactly; otherwise the arm catches up
+    within its limits and without overshoot of a resting set-point. Without a set-point it brakes
+    and holds. Yaw is continuous: it turns the short way and is not wrapped.
+    """
+
+    def __init__(self, start: Pose, params: ArmPlantParams | None = None, tick: int = 0) -> None:
+        _check_pose("arm plant start", start)
+        self.params = params or ArmPlantParams()
+        self._from = self._to = tuple(float(v) for v in start)
+        self._velocity = [0.0] * 4
+        self._setpoint: list[float] | None = None
+        self._tick = tick
+
+    @property
+    def velocity(self) -> Pose:
+        """Velocity in the present period: m/s and rad/s."""
+        x, y, z, yaw = self._velocity
+        return x, y, z, yaw
+
+    def step(self, tick: int, setpoint: Pose | None) -> Pose:
+        """Begin the period of 16 ticks that starts at ``tick``; returns the pose at its end.
+
+        setpoint: (x, y, z, yaw), m and rad, or None when none came. Periods follow one another
+        without a gap from the constructor's tick. Raises PlantError otherwise, or for a set-point
+        that is not finite.
+        """
+        if tick != self._tick:
+            raise PlantError(f"arm plant tick: expected {self._tick}, found {tick}")
+        if setpoint is not None:
+            _check_pose(f"arm plant set-point, tick {tick}", setpoint)
+        p, now = self.params, self._to
+        if setpoint is None:
+            error = drift = None
+            self._setpoint = None
+        else:
+            goal = [float(v) for v in setpoint]
+            goal[3] = now[3] + _wrapped(goal[3] - now[3])
+            before = self._setpoint or goal
+            drift = [(a - b) / ARM_SECONDS for a, b in zip(goal, before, strict=True)]
+            drift[3] = _wrapped(goal[3] - before[3]) / ARM_SECONDS
+            error = [a - b for a, b in zip(goal, now, strict=True)]
+            self._setpoint = goal
+        for axes, speed, acceleration in (
+            (slice(0, 3), p.speed, p.acceleration),
+            (slice(3, 4), p.turn_speed, p.turn_acceleration),
+        ):
+            self._velocity[axes] = _follow(
+                self._velocity[axes],
+                None if error is None else error[axes],
+                None if drift is None else drift[axes],
+                speed,
+                acceleration,
+            )
+        self._from = now
+        self._to = tuple(a + v * ARM_SECONDS for a, v in zip(now, self._velocity, strict=True))
+        if error is not None:
+            # Land on the set-point itself where it is reached, free of rounding.
+            self._to = tuple(
+                g if abs(g - t) < 1e-12 else t for g, t in zip(goal, self._to, strict=True)
+            )
+        self._tick = tick + ARM_PERIOD
+        x, y, z, yaw = self._to
+        return x, y, z, yaw
+
+    def pose_at(self, tick: int) -> Pose:
+        """The pose at a tick of the present period, linear between its ends."""
+        begin = self._tick - ARM_PERIOD
+        if not begin <= tick <= self._tick:
+            raise PlantError(f"arm plant pose: expected tick {begin} to {self._tick}, found {tick}")
+        if tick == self._tick:
+            x, y, z, yaw = self._to
+        else:
+            part = (tick - begin) / ARM_PERIOD
+            x, y, z, yaw = (
+                a + (b - a) * part for a, b in zip(self._from, self._to, strict=True)
+            )
+        return x, y, z, yaw
+
+
+def _check_pose(where: str, pose: Pose) -> None:
+    if len(pose) != 4 or not all(math.isfinite(v) and abs(v) <= h.POSE_LIMIT for v in pose):
+        raise PlantError(f"{where}: expected x, y, z, yaw within +-{h.POSE_LIMIT:g}, found {pose}")
+
+
+def _wrapped(angle: float) -> float:
+    return angle - 2 * math.pi * math.floor(angle / (2 * math.pi) + 0.5)
+
+
+def _norm(values: list[float]) -> float:
+    return math.sqrt(sum(v * v for v in values))
+
+
+def _follow(
+    velocity: list[float],
+    error: list[float] | None,
+    drift: list[float] | None,
+    speed: float,
+    acceleration: float,
+) -> list[float]:
+    """Velocity of the next period towards a set-point ``error`` away that moves with ``drift``."""
+    step = acceleration * ARM_SECONDS
+    wanted = [0.0] * len(velocity)
+    if error is not None and drift is not None:
+        distance = _norm(error)
+        exact = [e / ARM_SECONDS for e in error]
+        change = _norm([a - b for a, b in zip(exact, velocity, strict=True)])
+        if _norm(exact) <= speed * (1 + 1e-9) and change <= step * (1 + 1e-9):
+            return exact
+        if distance > 0.0:
+            # Fastest approach from which a stop at the set-point is still possible.
+            half = ARM_SECONDS / 2
+            approach = acceleration * (math.sqrt(half * half + 2 * distance / acceleration) - half)
+            approach = min(approach, distance / ARM_SECONDS)
+            wanted = [d + e * approach / distance for d, e in zip(drift, error, strict=True)]
+        else:
+            wanted = list(drift)
+        total = _norm(wanted)
+        if total > speed:
+            wanted = [w * speed / total for w in wanted]
+    change_of = [w - v for w, v in zip(wanted, velocity, strict=True)]
+    change = _norm(change_of)
+    if change > step:
+        return [v + c * step / change for v, c in zip(velocity, change_of, strict=True)]
+    return wanted
