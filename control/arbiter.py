@@ -193,8 +193,8 @@ class Arbiter:
         out = np.empty(WHISKERS, dtype=np.float32)
         reason, i = _admit(self._wanted, self._travel, self._last, self._slew_limit, out)
         if reason != ADMITTED:
-            what = f"{whisker_name(i)} commanded to {self._wanted[i]} rad"
-            return self._fall_back(f"{what}, expected in [0, {self._travel[i]}]")
+            what = f"{whisker_name(i)} commanded to {self._wanted[i]:.6g} rad"
+            return self._fall_back(f"{what}, expected in [0, {self._travel[i]:.6g}]")
         self.misses = 0
         return Routing(self._give(out), None)
 

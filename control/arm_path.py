@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,12 +76,29 @@ class Motion:
 class Route:
     """Way-points joined by straight legs; the head rests at each.
 
-    points        float64[n, 2], m
-    circuit_ends  int64[k], index of the point at which circuit 0, 1, .. is complete
+    points        float64[n, 2], m; neighbours differ
+    circuit_ends  int64[k], index of the point at which circuit 0, 1, .. is complete; the last of
+                  them is the last point
+
+    Raises ArmPathError.
     """
 
     points: Float64s
     circuit_ends: Int64s
+
+    def __post_init__(self) -> None:
+        if self.points.ndim != 2 or self.points.shape[1] != 2 or len(self.points) < 2:
+            raise ArmPathError(f"route: points of shape {self.points.shape}, expected (n >= 2, 2)")
+        for k in range(len(self.points)):
+            if not np.isfinite(self.points[k]).all():
+                raise ArmPathError(f"route: point {k} is {self.points[k]}, expected finite")
+            if k and (self.points[k] == self.points[k - 1]).all():
+                raise ArmPathError(f"route: point {k} is point {k - 1} again, expected another")
+        ends = [0, *self.circuit_ends.tolist()]
+        if ends[-1] != len(self.points) - 1 or any(b <= a for a, b in pairwise(ends)):
+            raise ArmPathError(
+                f"route: circuit ends {ends[1:]}, expected increasing up to {len(self.points) - 1}"
+            )
 
 
 def circuit(
@@ -88,12 +106,13 @@ def circuit(
 ) -> Route:
     """Circuits along the ring of cell centres `inset` cells inside the maze's edge.
 
-    Each starts and ends in the middle of the south side (cell maze_width // 2). sequence: one
-    letter per circuit, C clockwise and A anticlockwise seen from above, e.g. "CCCAAACACA".
-    pitch: m. Raises ArmPathError.
+    Each starts and ends in the middle of the south side. sequence: one letter per circuit, C
+    clockwise and A anticlockwise seen from above, e.g. "CCCAAACACA". pitch: m.
+    Raises ArmPathError.
     """
-    first, last_x, last_y = inset, maze_width - 1 - inset, maze_height - 1 - inset
-    if inset < 0 or last_x <= first or last_y <= first:
+    west, east = inset, maze_width - 1 - inset
+    south, north = inset, maze_height - 1 - inset
+    if inset < 0 or east <= west or north <= south:
         raise ArmPathError(
             f"circuit: maze of {maze_width} x {maze_height} cells has no ring at inset {inset}"
         )
@@ -101,9 +120,9 @@ def circuit(
         raise ArmPathError(f"circuit: pitch {pitch} m, expected finite and > 0")
     if not sequence or set(sequence) - {"C", "A"}:
         raise ArmPathError(f"circuit: sequence {sequence!r}, expected letters C and A")
-    start = (maze_width // 2, first)
-    clockwise = [(first, first), (first, last_y), (last_x, last_y), (last_x, first)]
-    cells = [start]
+    start = ((west + east) / 2, south)
+    clockwise = [(west, south), (west, north), (east, north), (east, south)]
+    cells: list[tuple[float, int]] = [start]
     for letter in sequence:
         cells += clockwise if letter == "C" else clockwise[::-1]
         cells.append(start)

@@ -72,9 +72,9 @@ class RcpParams:
 
     whisk              the unperturbed whisk
     gain               rad per N m per ring (front, mid, rear), >= 0
-    window_ticks       length of the averaging window, >= 1. The default, 10 ms, keeps the loop through
-                       a 10 Hz motor stable on contacts down to half the whisker, 2.2 times stiffer
-                       than the normalisation assumes; means over 20 ms or more chatter there
+    window_ticks       length of the averaging window, >= 1. The default, 10 ms, keeps the loop
+                       through a 10 Hz motor stable on contacts down to half the whisker, 2.2 times
+                       stiffer than the normalisation assumes; 20 ms or more chatter there
     amplitude_minimum  float64[18] rad (or one number), A_min, in [0, whisk.amplitude]
     reset              "cycle": the window is emptied at each cycle start;
                        "latch": the same, and within a cycle the amplitude never grows again;

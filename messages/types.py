@@ -38,7 +38,7 @@ Pose = Annotated[F64, f64(4, limit=1e3, unit="m, m, m, rad")]
 Pixels = Annotated[U8, Array("|u1", (WHISKERS,), unit="tip height code, 0 = no contact")]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class TimerTick:
     """A tick of the host's timer; never published, rebuilt from receipts in a re-run."""
 
@@ -46,7 +46,7 @@ class TimerTick:
     tick: Tick
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class HeadReading:
     """What the head device measured at a tick, and which command it was obeying meanwhile."""
 
@@ -59,7 +59,7 @@ class HeadReading:
     y: Moments
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class HeadSample:
     """A reading as the system uses it, with the command that was applied while it was taken."""
 
@@ -72,7 +72,7 @@ class HeadSample:
     command: Angles
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class WhiskCommand:
     """Desired protraction of every whisker, answering the sample of `tick`."""
 
@@ -81,7 +81,7 @@ class WhiskCommand:
     command: Angles
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class HeadCommand:
     """The one command per tick that the arbiter lets through to the drives."""
 
@@ -91,7 +91,7 @@ class HeadCommand:
     command: Angles
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class WhiskCycle:
     """A completed whisk cycle: samples first_tick .. last_tick, both included."""
 
@@ -104,7 +104,7 @@ class WhiskCycle:
     """Largest desired protraction of the cycle."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class WhiskCalibration:
     """Free-whisking statistics per whisker (mean, sigma) and the contact thresholds from them."""
 
@@ -118,7 +118,7 @@ class WhiskCalibration:
     threshold_dy: Annotated[F32, f32(WHISKERS, limit=10.0, unit="N m")]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class ArmReading:
     """Head pose as the arm device reports it."""
 
@@ -127,7 +127,7 @@ class ArmReading:
     pose: Pose
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class ArmState:
     """Head pose as the system uses it (ground truth), with where the path is."""
 
@@ -137,7 +137,7 @@ class ArmState:
     moving: Annotated[int, Int(0, 1)]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class ArmSetpoint:
     """Where the arm is told to be at its next 125 Hz cycle."""
 
@@ -146,7 +146,7 @@ class ArmSetpoint:
     pose: Pose
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class SlamView:
     """The tactile images of a whisk cycle and the local view that one of them matched."""
 
@@ -160,7 +160,7 @@ class SlamView:
     error: Annotated[float, Real(1e6, "mean absolute pixel difference, -1 for none compared")]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class SlamPose:
     """Where SLAM believes the head is, beside the odometry it was given and the truth."""
 
@@ -173,7 +173,7 @@ class SlamPose:
     truth: Pose
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class SlamMap:
     """The experience map: poses in the map frame and links between experiences."""
 
@@ -183,7 +183,7 @@ class SlamMap:
     links: Annotated[I32, Array("<i4", (-1, 2), unit="from, to")]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Metrics:
     """Scores up to a cycle; -1 where a score is not defined yet."""
 
@@ -199,7 +199,7 @@ class Metrics:
     templates: Annotated[int, Int(0, 2**31)]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Event:
     """Something a person, a watchdog or a node decided, with the tick at which it took effect."""
 
@@ -210,7 +210,7 @@ class Event:
     cause: Annotated[str, Text(400)]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Receipt:
     """What a node consumed, step by step, and what came of it.
 
@@ -227,7 +227,7 @@ class Receipt:
     digest: Annotated[U32, Array("<u4", (-1,))]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Telemetry:
     """Wall-clock facts of a host over the last second; recorded, never compared."""
 

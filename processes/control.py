@@ -1,8 +1,8 @@
 """The control channel between supervisor and processes: a few small, checked messages.
 
-A process says hello, ready, beat, fault, bye; the supervisor says go, finish, leave. Every message is
-a msgpack map {"kind": ..., ...}. Nothing that changes what a node computes travels here: that goes
-over `run.event`, where it is recorded.
+A process says hello, ready, beat, fault, bye; the supervisor says go, finish, leave. Every message
+is a msgpack map {"kind": ..., ...}. Nothing that changes what a node computes travels here: that
+goes over `run.event`, where it is recorded.
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ import collections
 import os
 import signal
 import time
+import traceback
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -28,6 +29,7 @@ from vibrissa.processes.group import Group, Steps
 from vibrissa.processes.layout import Layout
 from vibrissa.processes.node import Step, Stepper, timer_frame
 from vibrissa.processes.receipts import ReceiptBook
+from vibrissa.processes.rehearsal import rehearse
 from vibrissa.processes.stats import Clocking, Histogram
 from vibrissa.processes.table import PROCESSES, build
 
@@ -92,7 +94,10 @@ class Host:
         try:
             loop[self.pacing]()
         except MessageError as error:
-            self._fault(str(error))
+            self.control.say("fault", cause=str(error)[:400])
+        except Exception as error:
+            traceback.print_exc()
+            self.control.say("fault", cause=f"{type(error).__name__}: {error}"[:400])
         self._flush(final=True)
         self.control.say(
             "bye",
@@ -147,10 +152,10 @@ class Host:
         while not self.stopping:
             frame = self.port.receive(0)
             if frame is None:
-                self._housekeep()
                 time.sleep(DRAIN_S)
             else:
                 self._feed(frame)
+            self._housekeep()
 
     def _feed(self, frame: bytes) -> None:
         self._mark = time.monotonic_ns()
@@ -239,9 +244,6 @@ class Host:
             self._publish_own(frame)
             self._feed(frame)
 
-    def _fault(self, cause: str) -> None:
-        self.control.say("fault", cause=cause[:400])
-
     def _wait_to_leave(self) -> None:
         deadline = time.monotonic() + 15
         while time.monotonic() < deadline and os.getppid() == self._parent:
@@ -251,16 +253,6 @@ class Host:
         self.control.close()
         self.port.close()
         self.context.term()
-
-
-def rehearse(name: str, experiment: Experiment) -> None:
-    """Run a throw-away node through everything it will do, so that the real one is warm."""
-    node = build(name, experiment)
-    rehearsal = getattr(node, "rehearse", None)
-    if rehearsal is not None:
-        stepper = Stepper(name, node)
-        for frame in rehearsal():
-            stepper.step(frame)
 
 
 def counters(stepper: Stepper) -> dict[str, int]:

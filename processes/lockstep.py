@@ -1,7 +1,7 @@
 """Steppers in processes of their own, reached over real sockets: the lockstep workers.
 
-A worker is asked for a batch of steps at a time and answers with the digest and the output frames of
-each. Because it runs the same `Stepper` as every other executor, it gives the same bytes.
+A worker is asked for a batch of steps at a time and answers with the digest and the output frames
+of each. Because it runs the same `Stepper` as every other executor, it gives the same bytes.
 """
 
 from __future__ import annotations

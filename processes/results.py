@@ -40,8 +40,8 @@ class Difference:
 
     def __str__(self) -> str:
         return (
-            f"node {self.node}, step {self.step} (t = {self.t_s:.4f} s), {self.topic}.{self.field}: "
-            f"recorded {self.recorded}, re-run gives {self.recomputed}"
+            f"node {self.node}, step {self.step} (t = {self.t_s:.4f} s), "
+            f"{self.topic}.{self.field}: recorded {self.recorded}, re-run gives {self.recomputed}"
         )
 
 

@@ -66,7 +66,7 @@ class SamplerNode:
         controller = ControllerId(source, epoch)
         routing = self._arbiter.on_command(controller, command.tick, command.command)
         if routing.decision is not None and routing.decision.kind == "refused":
-            self._late += 1
+            self._late += controller == self._arbiter.active
             return []  # a late command is counted; one event per late command would flood the log
         return self._routed(command.tick, routing)
 

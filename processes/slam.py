@@ -1,7 +1,7 @@
 """The slam process: a tactile image per whisk cycle, odometry, RatSLAM, metrics.
 
-Samples and arm states are kept by tick until a whisk cycle is complete, so what is computed does not
-depend on how messages of different processes interleave.
+Samples and arm states are kept by tick until a whisk cycle is complete, so what is computed does
+not depend on how messages of different processes interleave.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""The supervisor: starts the process table, holds the start barrier, watches, and ends runs in order.
+"""The supervisor: starts the process table, holds the start barrier, watches, ends runs in order.
 
 A run passes through these phases: warming (every process imports, compiles, rehearses, connects),
 running, and, whatever ended it, retracting (whiskers retract, the arm holds), stopping (every node
-takes the stop as its last input and hands in its receipts) and closing (the recorder writes out what
-was sent). Ctrl-C, a fault, a silent or a dead process all lead through the same end, which names the
-cause.
+takes the stop as its last input and hands in its receipts) and closing (the recorder writes out
+what was sent). Ctrl-C, a fault, a silent or a dead process all lead through the same end, which
+names the cause.
 """
 
 from __future__ import annotations

@@ -151,21 +151,22 @@ class NodeCheck:
     def _compare(
         self, entry: Entry, frame: bytes, digest: int, outputs: Sequence[bytes]
     ) -> Finding | None:
-        consumed = (entry.stream, entry.seq)
-        t = header(frame)[4]
         for output in outputs:
-            topic, source, epoch, seq, _ = header(output)
+            topic = output[: output.find(b"\0")].decode()
             if not TOPICS[topic].recorded:
                 continue
             expected = self._expected[topic]
             recorded = expected.popleft() if expected else None
             if recorded != output:
                 field, then, now = differing_field(recorded, output)
+                _, source, epoch, seq, t = header(output)
                 difference = Difference(self.name, entry.step, topic, field, then, now, t * 1e-9)
-                return Finding(difference, t, ((topic, source, epoch), seq), consumed)
+                altered = ((topic, source, epoch), seq)
+                return Finding(difference, t, altered, (entry.stream, entry.seq))
             self.messages += 1
             self.bytes += len(output)
         if digest != entry.digest:
+            t = header(frame)[4]
             difference = Difference(
                 self.name,
                 entry.step,
@@ -175,7 +176,7 @@ class NodeCheck:
                 f"digest {digest:08x} (the order of receipts or an input was altered)",
                 t * 1e-9,
             )
-            return Finding(difference, t, None, consumed)
+            return Finding(difference, t, None, (entry.stream, entry.seq))
         return None
 
 

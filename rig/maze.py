@@ -96,9 +96,8 @@ def parse_maze(text: str, name: str) -> Maze:
         for i in range(width):
             wall = lines[row][4 * i + 1 : 4 * i + 4]
             if wall not in ("---", "   "):
-                bad = next(k for k in range(3) if wall[k] != "-" or wall[0] != "-")
-                if wall[0] == " ":
-                    bad = next(k for k in range(3) if wall[k] != " ")
+                bad = next((k for k in range(3) if wall[k] != wall[0]), 0)
+                bad = bad if wall[0] in "- " else 0
                 raise fail(row, 4 * i + 1 + bad, "a wall --- or three blanks", repr(wall))
             horizontal[j, i] = wall == "---"
     for row in range(1, 2 * height, 2):

@@ -306,10 +306,9 @@ class ArmPlant:
             self._setpoint = None
         else:
             goal = [float(v) for v in setpoint]
-            goal[3] = now[3] + _wrapped(goal[3] - now[3])
+            goal[3] += 2 * math.pi * math.floor((now[3] - goal[3]) / (2 * math.pi) + 0.5)
             before = self._setpoint or goal
             drift = [(a - b) / ARM_SECONDS for a, b in zip(goal, before, strict=True)]
-            drift[3] = _wrapped(goal[3] - before[3]) / ARM_SECONDS
             error = [a - b for a, b in zip(goal, now, strict=True)]
             self._setpoint = goal
         for axes, speed, acceleration in (
@@ -354,10 +353,6 @@ def _check_pose(where: str, pose: Pose) -> None:
         raise PlantError(f"{where}: expected x, y, z, yaw within +-{h.POSE_LIMIT:g}, found {pose}")
 
 
-def _wrapped(angle: float) -> float:
-    return angle - 2 * math.pi * math.floor(angle / (2 * math.pi) + 0.5)
-
-
 def _norm(values: list[float]) -> float:
     return math.sqrt(sum(v * v for v in values))
 
@@ -376,7 +371,8 @@ def _follow(
         distance = _norm(error)
         exact = [e / ARM_SECONDS for e in error]
         change = _norm([a - b for a, b in zip(exact, velocity, strict=True)])
-        if _norm(exact) <= speed * (1 + 1e-9) and change <= step * (1 + 1e-9):
+        closing = _norm([a - b for a, b in zip(exact, drift, strict=True)])
+        if _norm(exact) <= speed * (1 + 1e-9) and max(change, closing) <= step * (1 + 1e-9):
             return exact
         if distance > 0.0:
             # Fastest approach from which a stop at the set-point is still possible.

@@ -11,7 +11,8 @@ In faithful mode these defects of the original are reproduced, which are otherwi
 - the newest ten templates never inject, except that all of them do while fewer than ten exist
   (fixed: the newest ten never inject);
 - a read-out coordinate equal to the length of its axis is not wrapped to 0, and a view remembered
-  there never injects.
+  there never injects;
+- a view seen exactly on a cell injects there or one cell lower, as rounding has it.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ RECENT_TEMPLATES: Final = 10
 MAX_CELLS_PER_STEP: Final = 10_000.0
 MAX_TURN_PER_STEP: Final = 1e6
 READOUT_HALF_WIDTH: Final = 3
+ON_A_CELL: Final = 1e-9
 
 
 class PoseCellError(RuntimeError):
@@ -252,11 +254,13 @@ class PoseCells:
             th += t
         while th > t:
             th -= t
-        i, j, k = int(x), int(y), int(th)
         if not self._config.faithful:
+            i, j, k = (int(a + ON_A_CELL) for a in (x, y, th))
             i, j, k = i % n, j % n, k % t
-        elif i >= n or j >= n or k >= t:
-            return
+        else:
+            i, j, k = int(x), int(y), int(th)
+            if i >= n or j >= n or k >= t:
+                return
         self._cells[k, j, i] += energy
         self._alive[k] = 1
 

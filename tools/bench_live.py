@@ -1,8 +1,8 @@
 """`vibrissa bench live`: how late, how fast and how dear a live run is, beside bare floors.
 
 In one call: floors, a live run of the default experiment, the same with `sampler` and `whisk` in
-one process, floors again. Lateness (a due tick to the start of its step), work time (a step), period
-(start to start) and latency (a sample going out to its command coming back) are kept apart.
+one process, floors again. Lateness (a due tick to the start of its step), work time (a step),
+period (start to start) and latency (a sample going out to its command coming back) are kept apart.
 """
 
 from __future__ import annotations

@@ -45,17 +45,16 @@ def recover(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Copy what is usable of a cut-off or damaged log into a new, closed one.
+    """Copy every readable record of a cut-off or damaged log into a new, closed one.
 
-    Kept is everything up to the last step whose cause and consequence were both recorded. The
-    original is never changed. Exit code 2 when nothing can be saved.
+    `verify` re-runs what was recovered up to each node's last complete step. The original is never
+    changed. Exit code 2 when nothing can be saved.
     """
     from vibrissa.messages.recover import recover as recover_log
-    from vibrissa.processes.verify import complete_prefix
 
     path = log_file(log)
     out = out or path.with_name(f"{path.stem}-recovered.mcap")
-    found = recover_log(path, out, complete_prefix)
+    found = recover_log(path, out)
     if as_json:
         print_json({"out": out, "lossless": found.lossless, **dataclasses.asdict(found)})
         return

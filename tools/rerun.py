@@ -25,6 +25,10 @@ def verify(
         ExecutorName,
         typer.Option(help="fused: one process; lockstep: the real processes over real sockets."),
     ] = ExecutorName.fused,
+    replace: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NODE=module:Class", help="The replacements of a what-if run."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Re-run a log and compare every output byte for byte.
@@ -35,7 +39,9 @@ def verify(
     from vibrissa.processes.verify import verify as verify_log
 
     with progress_bar() as on_progress:
-        verdict = verify_log(log_file(log), executor.value, on_progress)
+        verdict = verify_log(
+            log_file(log), executor.value, on_progress, _replacements(replace or [])
+        )
     if as_json:
         print_json(verdict.to_json())
     else:
@@ -91,10 +97,9 @@ def replay(
             for key, value in played.items():
                 stdout().print(f"{key}: {value}", markup=False)
         return
-    replacements = dict(_replacement(text) for text in replace)
     out = out or next_directory("what-if")
     with progress_bar() as on_progress:
-        summary = what_if(log_file(log), replacements, out, on_progress)
+        summary = what_if(log_file(log), _replacements(replace), out, on_progress)
     report(summary, out, as_json)
 
 
@@ -104,9 +109,12 @@ VERBS = (
 )
 
 
-def _replacement(text: str) -> tuple[str, str]:
-    node, equals, target = text.partition("=")
-    module, colon, attribute = target.partition(":")
-    if not (node and equals and module and colon and attribute):
-        raise typer.BadParameter(f"--replace: expected NODE=module:Class, found {text!r}")
-    return node, target
+def _replacements(texts: list[str]) -> dict[str, str]:
+    """NODE=module:Class as typed. What is wrong behind the "=" is said where it is imported."""
+    replacements = {}
+    for text in texts:
+        node, equals, target = text.partition("=")
+        if not equals:
+            raise typer.BadParameter(f"--replace: expected NODE=module:Class, found {text!r}")
+        replacements[node] = target
+    return replacements

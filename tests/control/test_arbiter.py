@@ -81,7 +81,7 @@ def test_a_jump_is_slew_limited() -> None:
     [
         (np.nan, r"whisker 9 (mid ring) commanded to nan rad, expected in [0, 0.671"),
         (np.inf, r"whisker 9 (mid ring) commanded to inf rad, expected in [0, 0.671"),
-        (-1e-6, r"whisker 9 (mid ring) commanded to -1"),
+        (-1e-6, r"whisker 9 (mid ring) commanded to -1e-06 rad, expected in [0, 0.671083]"),
         (0.68, r"whisker 9 (mid ring) commanded to 0.68"),
     ],
 )

@@ -86,7 +86,7 @@ def test_line_ends_trailing_blanks_and_round_posts_are_tolerated(text: str) -> N
         (SMALL.replace("|   | G |", "|   | G |  |"), "line 4, column 10"),
         (SMALL.replace("| S     |", "| S   S |"), "line 2, column 7"),
         (SMALL + "| S\n", "line 6"),
-        (SMALL.replace("\n", "\r", 1), "line 1, column 19"),
+        (SMALL.replace("\n", "\r", 1), "line 1, column 20"),
     ],
 )
 def test_broken_maze_is_refused_with_its_place(text: str, place: str) -> None:
