@@ -180,6 +180,8 @@ class Arbiter:
         that is not accepted is refused and changes nothing. Every refused command is a decision:
         commands of controllers in shadow need not come here.
         """
+        if controller == RETRACT:
+            return self._refuse(controller, "built in, takes no commands from outside")
         if controller != self.active:
             return self._refuse(controller, f"not active, {self.active} is")
         if tick != self._tick:

@@ -27,7 +27,7 @@ from vibrissa.processes.config import Experiment
 from vibrissa.processes.control import ControlLine
 from vibrissa.processes.group import Group, Steps
 from vibrissa.processes.layout import Layout
-from vibrissa.processes.node import Step, Stepper, timer_frame
+from vibrissa.processes.node import Step, Stepper, counters, timer_frame
 from vibrissa.processes.receipts import ReceiptBook
 from vibrissa.processes.rehearsal import rehearse
 from vibrissa.processes.stats import Clocking, Histogram
@@ -253,12 +253,6 @@ class Host:
         self.control.close()
         self.port.close()
         self.context.term()
-
-
-def counters(stepper: Stepper) -> dict[str, int]:
-    """What a node counted for the summary, if it counts anything."""
-    found: dict[str, int] = getattr(stepper.node, "counters", dict)()
-    return found
 
 
 def _quantiles(histogram: Histogram) -> np.ndarray[Any, np.dtype[np.float32]]:

@@ -66,6 +66,12 @@ class Stepper:
         return CODECS[topic].encode(self.name, self.epoch, seq, t, body)
 
 
+def counters(stepper: Stepper) -> dict[str, int]:
+    """What a node counted for the summary, if it counts anything."""
+    found: dict[str, int] = getattr(stepper.node, "counters", dict)()
+    return found
+
+
 def timer_frame(node: str, tick: int) -> bytes:
     """The input that a host's timer makes at a tick; a re-run rebuilds it from its receipt."""
     return CODECS["host.timer"].encode(node, 0, tick, tick * TICK_NS, TimerTick(tick))

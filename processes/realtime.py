@@ -15,6 +15,7 @@ import os
 import resource
 import signal
 import time
+from collections.abc import Callable
 from typing import Final
 
 _PR_SET_TIMERSLACK: Final = 29
@@ -26,7 +27,7 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 def set_timer_slack() -> bool:
     """Ask for 1 ns timer slack for this process and the threads it starts from now on."""
-    return _libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0) == 0
+    return bool(_libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0) == 0)
 
 
 def set_fifo(priority: int) -> bool:
@@ -43,7 +44,7 @@ def lock_memory() -> bool:
     soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     if soft != resource.RLIM_INFINITY and os.geteuid() != 0:
         return False  # a finite limit would make later allocations fail instead
-    return _libc.mlockall(_MCL_CURRENT_AND_FUTURE) == 0
+    return bool(_libc.mlockall(_MCL_CURRENT_AND_FUTURE) == 0)
 
 
 def die_with_parent() -> None:
@@ -89,7 +90,7 @@ def privileges() -> dict[str, tuple[bool, str]]:
     }
 
 
-def _in_child(attempt) -> bool:  # type: ignore[no-untyped-def]
+def _in_child(attempt: Callable[[], bool]) -> bool:
     pid = os.fork()
     if pid == 0:
         granted = False

@@ -8,24 +8,31 @@ from vibrissa.messages.codec import Message
 from vibrissa.messages.types import Event, HeadCommand, HeadReading, HeadSample, WhiskCommand
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.node import Output
+from vibrissa.processes.whisk import slew_limit
 
 CONTROLLER = ControllerId("whisk")
+RECOVERY_TICKS = 200
+"""Ticks in a row a controller must answer on time to get the drives back after it was late."""
 
 
 class SamplerNode:
     """Turns readings into samples and routes one command per tick to the drives.
 
     Until the operator's start, from the last half second of the run on, and whenever a stop or a
-    fault asks for it, the built-in retract controller has the drives.
+    fault asks for it, the built-in retract controller has the drives. It also takes over from a
+    controller that is late, until that controller has been on time for 0.1 s; one that sent what no
+    drive may get stays out.
     """
 
     def __init__(self, experiment: Experiment) -> None:
-        self._arbiter = Arbiter(paper_head().swing)
+        self._arbiter = Arbiter(paper_head().swing, slew_limit=slew_limit(experiment))
         self._retract_tick = experiment.retract_tick
         self._retracting = False
         self._ticks = 0
         self._answered = 0
         self._late = 0
+        self._punctual = 0
+        self._fell_back_late = False
 
     def step(self, message: Message) -> list[Output]:
         body = message.body
@@ -35,7 +42,7 @@ class SamplerNode:
             case "whisk.command":
                 return self._command(message.source, message.epoch, body)
             case "run.event" if body.kind == "start":
-                return [_event(self._arbiter.route(CONTROLLER))]
+                return self._route(CONTROLLER)
             case "run.event" | "host.event" if body.kind in ("retract", "stop"):
                 return self._start_retracting()
         return []
@@ -64,16 +71,23 @@ class SamplerNode:
 
     def _command(self, source: str, epoch: int, command: WhiskCommand) -> list[Output]:
         controller = ControllerId(source, epoch)
+        outputs: list[Output] = []
+        if self._fell_back_late and controller == CONTROLLER:
+            self._punctual = self._punctual + 1 if command.tick == self._arbiter.tick else 0
+            if self._punctual >= RECOVERY_TICKS:
+                outputs = self._route(CONTROLLER)
         routing = self._arbiter.on_command(controller, command.tick, command.command)
         if routing.decision is not None and routing.decision.kind == "refused":
-            self._late += controller == self._arbiter.active
-            return []  # a late command is counted; one event per late command would flood the log
-        return self._routed(command.tick, routing)
+            self._late += controller == self._arbiter.active and command.tick < self._arbiter.tick
+            return outputs  # counted; one event per late command would flood the log
+        return outputs + self._routed(command.tick, routing)
 
     def _routed(self, tick: int, routing: Routing) -> list[Output]:
         outputs: list[Output] = []
         if routing.decision is not None:
             outputs.append(_event(routing.decision))
+            self._fell_back_late = routing.decision.cause.startswith("no command")
+            self._punctual = 0
         if routing.command is not None:
             name = self._arbiter.active.name
             outputs.append(("head.command", HeadCommand(tick, name, routing.command)))
@@ -83,7 +97,11 @@ class SamplerNode:
         if self._retracting:
             return []
         self._retracting = True
-        return [_event(self._arbiter.route(RETRACT))]
+        return self._route(RETRACT)
+
+    def _route(self, controller: ControllerId) -> list[Output]:
+        self._fell_back_late = False
+        return [_event(self._arbiter.route(controller))]
 
 
 def _event(decision: Decision) -> Output:

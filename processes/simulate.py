@@ -16,7 +16,7 @@ from vibrissa.processes.config import Experiment
 from vibrissa.processes.framelog import FrameLog
 from vibrissa.processes.group import Group, Steps
 from vibrissa.processes.lockstep import workers
-from vibrissa.processes.node import Step, Stepper, timer_frame
+from vibrissa.processes.node import Step, Stepper, counters, timer_frame
 from vibrissa.processes.rebuild import make_stepper
 from vibrissa.processes.receipts import ReceiptBook
 from vibrissa.processes.results import Executor, OnProgress, Progress, RunError, silent
@@ -88,13 +88,9 @@ def simulate(
                 on_progress(Progress("simulating", tick / TICK_HZ, experiment.run.duration))
         decide("stop", experiment.ticks, "completed")
         recording.finish("completed")
-        counters = {
-            n: getattr(m.node, "counters", dict)()
-            for n, m in members.items()
-            if isinstance(m, Stepper)
-        }
+        counted = {n: counters(m) for n, m in members.items() if isinstance(m, Stepper)}
     elapsed = time.monotonic() - began
-    sampler = counters.get("sampler", {})
+    sampler = counted.get("sampler", {})
     summary = {
         "ok": True,
         "cause": "completed",
@@ -102,14 +98,14 @@ def simulate(
         "executor": executor,
         "ticks": sampler.get("ticks", experiment.ticks),
         "ticks_answered": sampler.get("answered", 0),
-        "cycles": counters.get("whisk", {}).get("cycles", 0),
+        "cycles": counted.get("whisk", {}).get("cycles", 0),
         "messages": {
             topic: {"sent": n, "received": n, "lost": 0}
             for topic, n in sorted(log.received.items())
         },
         "realtime_factor": round(experiment.run.duration / elapsed, 2),
         "steps": recording.steps,
-        "counters": counters,
+        "counters": counted,
         "events": decide.events,
         "log": str((out / "run.mcap").absolute()),
         "run_id": run_id,

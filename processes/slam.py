@@ -9,6 +9,7 @@ from __future__ import annotations
 import collections
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 
@@ -62,7 +63,8 @@ def make_slam_config(experiment: Experiment) -> RatSlamConfig:
         if name not in known:
             raise RunError(f"slam.parameters.{name}: no such RatSLAM parameter")
     try:
-        return dataclasses.replace(PRESETS[settings.preset], **settings.parameters)
+        changes: dict[str, Any] = dict(settings.parameters)
+        return dataclasses.replace(PRESETS[settings.preset], **changes)
     except ConfigError as error:
         raise RunError(f"slam.parameters.{error}") from None
 
@@ -253,21 +255,18 @@ class TrajectoryLog:
         base = first_circuit(self._truth)
         score = experience_metric(self.experiences, self._truth, base)
         pairs = fixed_interval(len(self._truth))
-        energies = [-1.0] * 4
+        estimated = reckoned = None
         if len(pairs):
             estimated = energy_metric(self._estimate, self._truth, pairs)
             reckoned = energy_metric(self._reckoned, self._truth, pairs)
-            energies = [
-                estimated.translation,
-                estimated.rotation,
-                reckoned.translation,
-                reckoned.rotation,
-            ]
         return Metrics(
-            cycle,
-            -1.0 if score.arr is None else score.arr,
-            -1.0 if score.arcr is None else score.arcr,
-            *energies,
+            cycle=cycle,
+            arr=-1.0 if score.arr is None else score.arr,
+            arcr=-1.0 if score.arcr is None else score.arcr,
+            em_translation=estimated.translation if estimated else -1.0,
+            em_rotation=estimated.rotation if estimated else -1.0,
+            odometry_translation=reckoned.translation if reckoned else -1.0,
+            odometry_rotation=reckoned.rotation if reckoned else -1.0,
             experiences=self._known,
             templates=self.templates,
         )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from vibrissa.control.calibration import Calibration, CalibrationError, Calibrator
@@ -27,9 +29,19 @@ from vibrissa.processes.results import RunError
 CONTROLLERS = ("open_loop", "rcp")
 
 
+LEAST_SLEW_LIMIT = 0.005
+"""Largest change of a command per tick, rad, unless fast whisking itself needs more."""
+
+
+def slew_limit(experiment: Experiment) -> float:
+    """rad per tick: what no command may exceed, a fifth above the whisk's own steepest change."""
+    swing = float(paper_head().swing.max())
+    return max(LEAST_SLEW_LIMIT, 1.2 * swing * math.pi / experiment.period_ticks)
+
+
 def make_controller(experiment: Experiment) -> Controller:
     """The controller an experiment names. Raises RunError for an unknown one."""
-    whisk = full_whisk(paper_head(), experiment.period_ticks)
+    whisk = full_whisk(paper_head(), experiment.period_ticks, slew_limit(experiment))
     settings = experiment.whisk
     if settings.controller == "open_loop":
         return OpenLoop(whisk)

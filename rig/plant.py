@@ -357,6 +357,15 @@ def _norm(values: list[float]) -> float:
     return math.sqrt(sum(v * v for v in values))
 
 
+def _stopping_speed(reach: float, step: float) -> float:
+    """Fastest speed now that, losing ``step`` per period, ends at rest where ``reach`` leads.
+
+    ``reach``: the speed (m/s) that would cover the distance in one period, > 0.
+    """
+    periods = max(math.ceil((math.sqrt(1 + 8 * reach / step) - 3) / 2), 0)
+    return reach / (periods + 1) + periods * step / 2
+
+
 def _follow(
     velocity: list[float],
     error: list[float] | None,
@@ -368,20 +377,16 @@ def _follow(
     step = acceleration * ARM_SECONDS
     wanted = [0.0] * len(velocity)
     if error is not None and drift is not None:
-        distance = _norm(error)
         exact = [e / ARM_SECONDS for e in error]
         change = _norm([a - b for a, b in zip(exact, velocity, strict=True)])
-        closing = _norm([a - b for a, b in zip(exact, drift, strict=True)])
-        if _norm(exact) <= speed * (1 + 1e-9) and max(change, closing) <= step * (1 + 1e-9):
+        # Where the set-point moves on, the lag behind it and the speed of catching up count.
+        catch_up = [a - b for a, b in zip(exact, drift, strict=True)]
+        closing = _norm(catch_up)
+        slack = 1 + 1e-9
+        if _norm(exact) <= speed * slack and max(change, closing) <= step * slack:
             return exact
-        if distance > 0.0:
-            # Fastest approach from which a stop at the set-point is still possible.
-            half = ARM_SECONDS / 2
-            approach = acceleration * (math.sqrt(half * half + 2 * distance / acceleration) - half)
-            approach = min(approach, distance / ARM_SECONDS)
-            wanted = [d + e * approach / distance for d, e in zip(drift, error, strict=True)]
-        else:
-            wanted = list(drift)
+        approach = _stopping_speed(closing, step)
+        wanted = [d + c * approach / closing for d, c in zip(drift, catch_up, strict=True)]
         total = _norm(wanted)
         if total > speed:
             wanted = [w * speed / total for w in wanted]

@@ -63,19 +63,11 @@ def main() -> None:
 
 
 def explain(error: Exception) -> str | None:
-    """The one line for an error that its reader can mend, None for a bug."""
-    from pydantic import ValidationError
+    """The one line for an error that its reader can mend, None for a bug.
 
-    from vibrissa.messages.errors import MessageError
-    from vibrissa.messages.log_format import LogError
-    from vibrissa.processes.results import RunError
-    from vibrissa.rig.maze import MazeError
-
-    if isinstance(error, ValidationError):
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        return f"{where}: {first['msg']}, found {first['input']!r}"
-    if isinstance(error, RunError | MessageError | LogError | MazeError):
+    Errors that this project defines are made for readers: one line with what, where, and why.
+    """
+    if type(error).__module__.startswith("vibrissa."):
         return str(error)
     if isinstance(error, OSError) and (error.filename or error.errno == errno.ENOSPC):
         return f"{error.filename or 'output'}: {error.strerror}"

@@ -1,4 +1,4 @@
-"""How the project's kernels are compiled, and when a compiled kernel on disk is still the right one."""
+"""How kernels are compiled, and how long the compiled code on disk stays valid."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def compiled(function: F) -> F:
 
 def inlined(function: F) -> F:
     """Like `compiled`, and part of whatever calls it, so that loops over it are vectorised."""
-    options = {"cache": True, "fastmath": False, "error_model": "numpy", "forceinline": True}
-    return cast(F, _checked(numba.njit(**options)(function)))
+    jit = numba.njit(cache=True, fastmath=False, error_model="numpy", forceinline=True)
+    return cast(F, _checked(jit(function)))
 
 
 def _checked(dispatcher: Any) -> Any:

@@ -91,12 +91,12 @@ _ATAN = (
 
 
 @inlined
-def _bits(x: float) -> int:
+def _bits(x: float) -> np.int64:
     return np.float64(x).view(np.int64)
 
 
 @inlined
-def _from_bits(b: int) -> float:
+def _from_bits(b: int | np.int64) -> float:
     return np.int64(b).view(np.float64)
 
 
@@ -229,7 +229,7 @@ def _angle(y: float, y_low: float, x: float, x_low: float) -> float:
     if d == np.inf:
         n, d = (1.0, 1.0) if n == np.inf else (0.0, 1.0)
     d = d if d > 0.0 else 1.0
-    exponent = min(_bits(d) >> 52, 2045)
+    exponent = min(int(_bits(d) >> 52), 2045)
     scale = _from_bits((2 * _BIAS - exponent) << 52)
     n, n_low, d, d_low = n * scale, n_low * scale, d * scale, d_low * scale
 

@@ -1,9 +1,9 @@
-"""Where the constants of `vibrissa/numerics.py` come from.
+"""Where the constants of `vibrissa/elementary.py` come from.
 
-Run ``python docs/derivations/elementary_functions.py`` (needs mpmath, takes some seconds): prints
+Run ``python docs/derivations/elementary_functions.py`` (needs mpmath, takes half a minute): prints
 every polynomial with its coefficients as written in the code and the largest error it leaves,
 measured after rounding the coefficients to doubles and relative to the function's value, in units
-of 2^-53; and the splittings of pi/2, pi/4 and ln 2.
+of 2^-53; and the splittings of pi/2, pi/4, 3 pi/4 and ln 2.
 
 Each polynomial is the minimax one (Remez exchange) of a function that is smooth and even where the
 original is odd or even, so that the leading terms stay exact:
@@ -99,7 +99,8 @@ def evaluate(coefficients: list[mpf], z: mpf) -> mpf:
 def _extremes(error: Function, low: mpf, high: mpf, count: int) -> list[mpf]:
     """`count` points of alternating sign where |error| is locally largest."""
     steps = 40 * count
-    grid = [(low + high) / 2 - (high - low) / 2 * mp.cos(mp.pi * i / steps) for i in range(steps + 1)]
+    middle, half = (low + high) / 2, (high - low) / 2
+    grid = [middle - half * mp.cos(mp.pi * i / steps) for i in range(steps + 1)]
     values = [error(z) for z in grid]
     runs: list[int] = []
     for i, value in enumerate(values):
@@ -118,7 +119,9 @@ def _extremes(error: Function, low: mpf, high: mpf, count: int) -> list[mpf]:
 def remez(p: Polynomial, target: Function, terms: int) -> list[mpf]:
     """The polynomial with the smallest largest |weight (polynomial - target)| on [low, high]."""
     middle, half = (p.low + p.high) / 2, (p.high - p.low) / 2
-    points = [middle - half * mp.cos(mp.pi * (2 * i + 1) / (2 * terms + 2)) for i in range(terms + 1)]
+    points = [
+        middle - half * mp.cos(mp.pi * (2 * i + 1) / (2 * terms + 2)) for i in range(terms + 1)
+    ]
     coefficients: list[mpf] = []
     for _ in range(8):
         matrix = mp.matrix(terms + 1, terms + 1)
@@ -164,7 +167,7 @@ def largest_error(p: Polynomial, coefficients: list[float]) -> mpf:
 
 
 def split(value: mpf, bits: tuple[int, ...]) -> list[float]:
-    """Parts of `value` that sum to it, each short enough to be multiplied exactly, then the rest."""
+    """Parts of `value` of so many bits each, short enough for exact products, and the rest."""
     parts = []
     for width in bits:
         scale = mpf(2) ** (width - int(mp.floor(mp.log(value, 2))) - 1)

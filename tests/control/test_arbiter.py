@@ -67,6 +67,16 @@ def test_every_refusal_is_named_and_changes_nothing() -> None:
     assert np.array_equal(a.last_command, HOME)
 
 
+def test_nobody_commands_in_the_name_of_the_built_in_controller() -> None:
+    a = arbiter()
+    a.on_sample(0)
+    a.route(RETRACT)
+    for bad in (0.001, np.nan):
+        cause = refusal(a.on_command(RETRACT, 0, angles(bad)))
+        assert cause == "built in, takes no commands from outside"
+    assert a.on_sample(1).command is not None
+
+
 def test_a_jump_is_slew_limited() -> None:
     a = arbiter()
     for tick in range(3):
@@ -254,7 +264,7 @@ def drive(
                 command = held.copy()
                 command[whisker] = value
                 routing = a.on_command(controller, a.tick - age, command[:length])
-                if controller != before:
+                if controller != before or controller == RETRACT:
                     refusal(routing)
             case Failure(controller):
                 routing = a.on_failure(controller, "died")

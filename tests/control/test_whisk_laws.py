@@ -156,6 +156,14 @@ def test_without_reset_the_window_slides_over_the_cycle_start() -> None:
     assert np.abs(felt[PERIOD + 160 :] - free[PERIOD + 160 :]).max() <= 2 * ULP
 
 
+def test_a_violent_touch_leaves_no_rounding_behind() -> None:
+    """The running sum of the window is renewed: 1e9 N m is gone once it has left the window."""
+    y = silence(2 * PERIOD)
+    y[20:60] += noise(40, 3, scale=1e9)
+    free, felt = run(open_loop(), y), run(rcp("never"), y)
+    assert np.abs(felt[PERIOD:] - free[PERIOD:]).max() <= 2 * ULP
+
+
 def test_the_latch_holds_the_smallest_amplitude_until_the_next_cycle() -> None:
     y = silence(2 * PERIOD)
     y[50:60] += np.float32(1e-3)
@@ -299,6 +307,16 @@ def test_a_newcomer_starts_from_the_last_command_and_never_jumps(
     commands = np.vstack([last, run(controller, noise(300, seed), tick)])
     limit = 0.003 if name == "retract" else WHISK.slew_limit
     assert np.abs(np.diff(commands.astype(np.float64), axis=0)).max() <= limit + ULP
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_a_newcomer_has_forgotten_everything_it_felt_before(name: str) -> None:
+    used, fresh = (CONTROLLERS[name][0]() for _ in range(2))
+    run(used, noise(70, 8))
+    for controller in (used, fresh):
+        controller.activate(70, np.full(WHISKERS, 0.1, dtype=np.float32), QUIET)
+    y = noise(PERIOD, 9)
+    assert run(used, y, 70).tobytes() == run(fresh, y, 70).tobytes()
 
 
 def test_a_newcomer_converges_to_its_own_law() -> None:
