@@ -8,9 +8,9 @@ Touch is told from the signals alone. Signals are averaged over blocks of 10 ms,
 white noise about a fifth, and three things are checked in x and in y of every whisker:
 
     excursion     a block mean leaves the whisker's own median block mean
-    offset        the whisker's median leaves the median of the six whiskers of its ring
+    offset        the whisker's median leaves the median of its ring, of those without excursion
                   (a whisker pressed against a wall all the time; weight is the same for all six)
-    ring offset   the median of the ring leaves zero (the whole ring pressed)
+    ring offset   that median of the ring leaves zero (the whole ring pressed)
 
 The noise that scales the first limit is measured from second differences within blocks, which
 neither weight nor a sustained touch moves, and is the median over the blocks and the ring.
@@ -274,21 +274,25 @@ class Calibrator:
                 found = f"{channel} {what} {value:.4g} N m, limit {limit:.4g}"
                 touched[whisker] = ratio, f"{whisker_name(whisker)} {found}"
 
+        median = np.median(self._block_mean, axis=2)
+        noise = np.median(self._block_noise, axis=2)
+        rings = [range(r * PER_RING, (r + 1) * PER_RING) for r in range(len(RINGS))]
         for c, channel in enumerate(CHANNELS):
-            medians = np.median(self._block_mean[c], axis=1)
-            noise = np.median(self._block_noise[c], axis=1)
-            for ring in range(len(RINGS)):
-                members = slice(ring * PER_RING, (ring + 1) * PER_RING)
-                ring_median = float(np.median(medians[members]))
-                sigma = float(np.median(noise[members]))
-                excursion_limit = max(limits.noise_multiple * sigma, limits.excursion)
-                for i in range(*members.indices(WHISKERS)):
-                    away = self._block_mean[c, i] - medians[i]
+            for ring in rings:
+                sigma = float(np.median(noise[c, ring]))
+                limit = max(limits.noise_multiple * sigma, limits.excursion)
+                for i in ring:
+                    away = self._block_mean[c, i] - median[c, i]
                     excursion = float(away[int(np.abs(away).argmax())])
-                    offset = float(medians[i]) - ring_median
-                    judge(i, channel, "excursion", excursion, excursion_limit)
+                    judge(i, channel, "excursion", excursion, limit)
+        steady = [[i for i in ring if i not in touched] for ring in rings]
+        for c, channel in enumerate(CHANNELS):
+            for members in filter(None, steady):
+                center = float(np.median(median[c, members]))
+                for i in members:
+                    offset = float(median[c, i]) - center
                     judge(i, channel, "offset from its ring", offset, limits.offset)
-                    judge(i, channel, "offset of the ring", ring_median, limits.ring_offset)
+                    judge(i, channel, "offset of the ring", center, limits.ring_offset)
         if touched:
             findings = "; ".join(touched[i][1] for i in sorted(touched))
             raise TouchedDuringCalibration(f"calibration: touched, not free: {findings}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibrissa.control.arm_path import ArmPath, Motion, circuit
+from vibrissa.control.arm_path import ArmLimits, ArmPath, Motion, circuit
 from vibrissa.messages.codec import Message
 from vibrissa.messages.types import TICK_HZ, TICK_NS, ArmReading, ArmSetpoint, ArmState
 from vibrissa.processes.config import Experiment
@@ -13,6 +13,8 @@ from vibrissa.rig.maze import parse_maze
 
 ARM_TICKS = 16
 """Ticks per arm cycle: 125 Hz, the UR10's CB3 controller."""
+MARGIN = 0.045
+"""m of board around the maze that the head may be over."""
 
 
 def make_path(experiment: Experiment) -> ArmPath:
@@ -27,7 +29,8 @@ def make_path(experiment: Experiment) -> ArmPath:
         t_start=experiment.calibration_ticks / TICK_HZ,
     )
     route = circuit(maze.width, maze.height, experiment.arm.sequence, pitch=maze.pitch)
-    return ArmPath(route, motion)
+    corner = (maze.width * maze.pitch + MARGIN, maze.height * maze.pitch + MARGIN, 0.4)
+    return ArmPath(route, motion, ArmLimits(lower=(-MARGIN, -MARGIN, 0.06), upper=corner))
 
 
 class ArmNode:

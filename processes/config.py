@@ -67,10 +67,10 @@ class Whisk(Section):
     """[whisk]"""
 
     controller: Annotated[str, Field(description="open_loop or rcp")] = "rcp"
-    period: Annotated[float, Field(ge=0.1, le=10, description="s per whisk cycle")] = 1.0
+    period: Annotated[float, Field(ge=0.2, le=10, description="s per whisk cycle")] = 1.0
     calibration_cycles: Annotated[int, Field(ge=1, le=1000)] = 4
     rcp_gain: Annotated[float, Field(ge=0, le=1000, description="in contact stiffnesses")] = 3.0
-    rcp_window: Annotated[float, Field(ge=0.0005, le=1, description="s, averaging window")] = 0.04
+    rcp_window: Annotated[float, Field(ge=0.0005, le=1, description="s, averaging window")] = 0.01
 
 
 class Arm(Section):
@@ -181,7 +181,26 @@ def load_experiment(
         text = _maze_text(experiment.maze.file, path.parent if path else Path())
         maze = experiment.maze.model_copy(update={"text": text})
         experiment = experiment.model_copy(update={"maze": maze})
+    _check_parts(experiment, where)
     return experiment
+
+
+def _check_parts(experiment: Experiment, where: str) -> None:
+    """What only the nodes' own modules can judge: maze, circuit, controller, RatSLAM parameters."""
+    from vibrissa.processes.arm import make_path
+    from vibrissa.processes.slam import make_slam_config
+    from vibrissa.processes.whisk import CONTROLLERS
+
+    name = experiment.whisk.controller
+    if name not in CONTROLLERS:
+        raise RunError(
+            f"{where}: whisk.controller {name!r}: expected one of {', '.join(CONTROLLERS)}"
+        )
+    try:
+        make_path(experiment)
+        make_slam_config(experiment)
+    except (ValueError, RunError) as error:
+        raise RunError(f"{where}: {error}") from None
 
 
 def _complaints(error: ValidationError) -> Iterator[str]:

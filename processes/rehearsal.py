@@ -19,8 +19,8 @@ from vibrissa.processes.config import Experiment
 from vibrissa.processes.node import Node, Stepper
 from vibrissa.processes.table import PROCESSES, build
 
-TICKS = 800
-PERIOD = 200
+TICKS = 1600
+PERIOD = 400
 ARM_TICKS = 16
 
 

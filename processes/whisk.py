@@ -24,7 +24,6 @@ from vibrissa.messages.types import (
 )
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.node import Output
-from vibrissa.processes.results import RunError
 
 CONTROLLERS = ("open_loop", "rcp")
 
@@ -40,17 +39,13 @@ def slew_limit(experiment: Experiment) -> float:
 
 
 def make_controller(experiment: Experiment) -> Controller:
-    """The controller an experiment names. Raises RunError for an unknown one."""
+    """The controller an experiment names, one of CONTROLLERS."""
     whisk = full_whisk(paper_head(), experiment.period_ticks, slew_limit(experiment))
     settings = experiment.whisk
     if settings.controller == "open_loop":
         return OpenLoop(whisk)
-    if settings.controller == "rcp":
-        window = max(round(settings.rcp_window * TICK_HZ), 1)
-        return Rcp(RcpParams(whisk, normalised_gain(settings.rcp_gain), window))
-    raise RunError(
-        f"whisk.controller: {settings.controller!r}, expected one of {', '.join(CONTROLLERS)}"
-    )
+    window = max(round(settings.rcp_window * TICK_HZ), 1)
+    return Rcp(RcpParams(whisk, normalised_gain(settings.rcp_gain), window))
 
 
 class WhiskNode:

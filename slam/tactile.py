@@ -31,7 +31,8 @@ HIGHEST_OBSTACLE: Final = 0.055
 NEAR_MAXIMUM: Final = math.radians(0.5)
 FAST_FILTER: Final = 0.005
 SLOW_FILTER: Final = 0.015
-SETTLING: Final = 0.03
+REFRACTORY: Final = 0.03
+"""A crossing counts after this time below the threshold, s; every cycle begins with it."""
 
 Image = NDArray[np.uint8]
 Samples = NDArray[np.float32]
@@ -115,7 +116,7 @@ class TactileImager:
             ]
         )
         self._fast, self._slow = _gains(dt)
-        self._settling = math.ceil(SETTLING / dt)
+        self._refractory = math.ceil(REFRACTORY / dt)
 
     def image(self, theta: Samples, x: Samples, y: Samples) -> TactileImages:
         """Images of one cycle: protraction theta (rad), deflections x, y (N m), float32[n, 18].
@@ -141,7 +142,7 @@ class TactileImager:
             self._calibration,
             self._fast,
             self._slow,
-            self._settling,
+            self._refractory,
             pixels,
         )
         if bad >= 0:
@@ -241,7 +242,7 @@ def _image(
     calibration: Floats,
     fast: float,
     slow: float,
-    settling: int,
+    refractory: int,
     pixels: NDArray[np.uint8],
 ) -> int:
     """Fill pixels uint8[3, 18] (gated, ungated, contact angle); -1, or the first bad sample."""
@@ -249,7 +250,7 @@ def _image(
     largest = np.empty(whiskers)
     touching = np.empty(whiskers)
     touched = np.empty(whiskers)
-    over = np.zeros(whiskers, dtype=np.uint8)
+    quiet_since = np.zeros(whiskers, dtype=np.int64)
     quick = np.empty(whiskers)
     lazy = np.empty(whiskers)
     for i in range(whiskers):
@@ -269,10 +270,10 @@ def _image(
                 touching[i] = max(touching[i], angle)
             quick[i] += fast * (deflection - quick[i])
             lazy[i] += slow * (deflection - lazy[i])
-            crossed = abs(quick[i] - lazy[i] - calibration[3, i]) > calibration[4, i]
-            if crossed and not over[i] and s >= settling and math.isnan(touched[i]):
-                touched[i] = angle
-            over[i] = crossed
+            if abs(quick[i] - lazy[i] - calibration[3, i]) > calibration[4, i]:
+                if s - quiet_since[i] >= refractory and math.isnan(touched[i]):
+                    touched[i] = angle
+                quiet_since[i] = s + 1
     for i in range(whiskers):
         height, length, start = geometry[0, i], geometry[1, i], geometry[2, i]
         if touching[i] >= largest[i] - NEAR_MAXIMUM:

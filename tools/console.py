@@ -101,7 +101,7 @@ def progress_bar() -> Iterator[OnProgress]:
     bars = Bars(
         TextColumn("{task.description:<10}"),
         BarColumn(),
-        TextColumn("{task.completed:6.1f} of {task.total:.1f} s"),
+        TextColumn("{task.fields[time]}"),
         TextColumn("{task.fields[note]}", style="dim"),
         console=console,
         auto_refresh=False,  # a refreshing thread would take time from the run it reports on
@@ -112,18 +112,15 @@ def progress_bar() -> Iterator[OnProgress]:
 
     def show(progress: Progress) -> None:
         nonlocal shown
-        new = progress.phase not in tasks
+        phase, done, total = progress.phase, progress.done_s, progress.total_s
+        new = phase not in tasks
         if new:
-            tasks[progress.phase] = bars.add_task(progress.phase, total=progress.total_s, note="")
+            tasks[phase] = bars.add_task(phase, total=total or None, time="", note="")
         now = time.monotonic()
-        if new or now - shown >= REFRESH_S or progress.done_s >= progress.total_s:
+        if new or now - shown >= REFRESH_S:
             shown = now
-            bars.update(
-                tasks[progress.phase],
-                completed=min(progress.done_s, progress.total_s),
-                total=progress.total_s,
-                note=progress.note,
-            )
+            told = f"{done:.1f} of {total:.1f} s" if total else f"{done:.1f} s"
+            bars.update(tasks[phase], completed=done, time=told, note=progress.note)
             bars.refresh()
 
     with bars:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from vibrissa.tools.console import Json, Log, fail, log_file, print_json, progress_bar, stdout
-from vibrissa.tools.run import next_directory, report
+from vibrissa.tools.run import next_directory
 
 
 class ExecutorName(enum.StrEnum):
@@ -77,6 +77,10 @@ def replay(
         Path | None,
         typer.Option(help="New directory for the what-if run. Default: the next runs/what-if-N."),
     ] = None,
+    endpoint: Annotated[
+        str,
+        typer.Option(help="Where to publish what is played, e.g. ipc:///tmp/played. Default: any."),
+    ] = "",
     as_json: Json = False,
 ) -> None:
     """Play a log for looking, or re-run it with a node replaced (what-if).
@@ -90,23 +94,27 @@ def replay(
         raise typer.BadParameter("--paced plays a log as it is; it can't go with --replace")
     if not replace:
         with progress_bar() as on_progress:
-            played = play(log_file(log), on_progress)
-        if as_json:
-            print_json(played)
-        else:
-            for key, value in played.items():
-                stdout().print(f"{key}: {value}", markup=False)
+            played = play(log_file(log), on_progress, endpoint)
+        _report(played, as_json)
         return
     out = out or next_directory("what-if")
     with progress_bar() as on_progress:
         summary = what_if(log_file(log), _replacements(replace), out, on_progress)
-    report(summary, out, as_json)
+    _report(summary, as_json)
 
 
 VERBS = (
     (verify, "vibrissa verify runs/first --executor lockstep"),
     (replay, "vibrissa replay runs/first --replace whisk=mylab.whisking:Node --out runs/if"),
 )
+
+
+def _report(found: dict[str, Any], as_json: bool) -> None:
+    if as_json:
+        print_json(found)
+        return
+    for key, value in found.items():
+        stdout().print(f"{key}: {value}", markup=False)
 
 
 def _replacements(texts: list[str]) -> dict[str, str]:

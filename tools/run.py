@@ -78,6 +78,9 @@ VERBS = (
     (simulate, "vibrissa simulate --seed 7 --duration 60 --out runs/seed-7"),
 )
 
+LINE = 120
+"""Characters shown of an event."""
+
 
 def next_directory(name: str, under: Path = Path("runs")) -> Path:
     """The first of NAME-1, NAME-2, ... that does not exist."""
@@ -98,12 +101,14 @@ def report(summary: dict[str, Any], out: Path, as_json: bool) -> None:
 
 
 def print_summary(summary: dict[str, Any], out: Path) -> None:
-    """A summary as tables for people."""
+    """A summary as tables for people; summary.json has every event in full."""
+    from rich.text import Text
+
     console = stdout()
     ticks, answered = summary["ticks"], summary["ticks_answered"]
     share = f", {answered / ticks:.3%} answered within one period" if ticks else ""
-    colour = "green" if summary["ok"] else "red"
-    console.print(f"[{colour}]{summary['cause']}[/{colour}]: {ticks} ticks{share}")
+    cause = Text(summary["cause"], style="green" if summary["ok"] else "red")
+    console.print(cause + Text(f": {ticks} ticks{share}"))
 
     traffic = table("messages", ("topic", "sent", "received", "lost"))
     for topic, counts in sorted(summary["messages"].items()):
@@ -129,10 +134,8 @@ def print_summary(summary: dict[str, Any], out: Path) -> None:
     if "cpu_cores" in summary:
         console.print(f"processor: {cores(summary['cpu_cores']):.2f} cores")
     for event in summary["events"]:
-        console.print(
-            f"tick {event['tick']}: {event['kind']} {event['node']} {event['cause']}".rstrip(),
-            markup=False,
-        )
+        line = f"tick {event['tick']}: {event['kind']} {event['node']} {event['cause']}".rstrip()
+        console.print(line if len(line) <= LINE else line[:LINE] + "...", markup=False)
     console.print(f"log {out / 'run.mcap'}, summary {out / 'summary.json'}", markup=False)
 
 

@@ -143,6 +143,15 @@ def test_whiskers_pressed_against_a_wall_all_the_time_are_refused(
     assert named == pressed
 
 
+def test_whiskers_that_touch_nothing_are_not_named_beside_those_that_do() -> None:
+    x, y = free_whisking()
+    y[SAMPLES // 4 :, 6:10] += 2e-3  # four of six: the median of all six would be theirs
+    with pytest.raises(TouchedDuringCalibration) as refusal:
+        calibrate(x, y)
+    named = {i for i in range(WHISKERS) if f"whisker {i} (" in str(refusal.value)}
+    assert named == {6, 7, 8, 9}
+
+
 def test_a_whole_ring_pressed_is_refused() -> None:
     x, y = free_whisking()
     y[:, 12:] += 1e-3

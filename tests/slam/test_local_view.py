@@ -165,9 +165,7 @@ def test_no_template_inherits_from_the_image_before():
 def test_a_shift_that_leaves_no_columns_matches_template_0_only_in_faithful_mode():
     rng = np.random.default_rng(5)
     images = rng.integers(100, 130, (6, 3, 6)).astype(np.uint8)
-    original = LocalView(
-        RatSlamConfig(template_x_size=6, template_y_size=3, faithful=True)
-    )
+    original = LocalView(RatSlamConfig(template_x_size=6, template_y_size=3, faithful=True))
     found = [original.on_image(image) for image in images]
     assert [f.template for f in found] == [0] * 6
     assert all(f.error == 0.0 and np.signbit(f.error) for f in found[1:])

@@ -184,23 +184,17 @@ def test_the_torus_has_no_special_place(shift, step, angle):
     place(there, np.roll(activity, (dj, di), (1, 2)))
     for network in (here, there):
         network.on_odo(step * CELL, angle, 1.0)
-    np.testing.assert_allclose(
-        np.roll(here.cells, (dj, di), (1, 2)), there.cells, atol=1e-12
-    )
+    np.testing.assert_allclose(np.roll(here.cells, (dj, di), (1, 2)), there.cells, atol=1e-12)
     place(here, activity)
     place(there, np.roll(activity, shift, (0, 1, 2)))
     for network in (here, there):
         network.on_odo(0.0, angle, 1.0)
-    np.testing.assert_allclose(
-        np.roll(here.cells, shift, (0, 1, 2)), there.cells, atol=1e-12
-    )
+    np.testing.assert_allclose(np.roll(here.cells, shift, (0, 1, 2)), there.cells, atol=1e-12)
 
 
 @settings(max_examples=20, deadline=None)
 @given(
-    steps=st.lists(
-        st.tuples(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0)), min_size=1, max_size=12
-    )
+    steps=st.lists(st.tuples(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0)), min_size=1, max_size=12)
 )
 def test_activity_is_conserved_and_never_negative(steps):
     network = PoseCells(IRAT)
