@@ -2,7 +2,7 @@
 
 VENV ?= .venv
 DURATION ?= 30
-BENCHES ?= live replay
+BENCHES ?= live replay faults
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help

@@ -233,9 +233,9 @@ class Telemetry:
 
     version: ClassVar[int] = 1
     steps: Annotated[int, Int(0, 2**40)]
-    lateness_us: Annotated[F32, f32(4, limit=1e12, unit="us: p50, p99, p99.9, max")]
-    work_us: Annotated[F32, f32(4, limit=1e12, unit="us: p50, p99, p99.9, max")]
-    latency_us: Annotated[F32, f32(4, limit=1e12, unit="us: p50, p99, p99.9, max")]
+    lateness_us: Annotated[F32, f32(2, limit=1e12, unit="us: mean, max")]
+    work_us: Annotated[F32, f32(2, limit=1e12, unit="us: mean, max")]
+    latency_us: Annotated[F32, f32(2, limit=1e12, unit="us: mean, max")]
     cpu_s: Annotated[float, Real(1e9, "s of processor time since the start")]
 
 

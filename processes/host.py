@@ -30,10 +30,11 @@ from vibrissa.processes.layout import Layout
 from vibrissa.processes.node import Step, Stepper, counters, timer_frame
 from vibrissa.processes.receipts import ReceiptBook
 from vibrissa.processes.rehearsal import rehearse
-from vibrissa.processes.stats import Clocking, Histogram
+from vibrissa.processes.stats import Clocking
 from vibrissa.processes.table import PROCESSES, build
 
 HOUSEKEEPING_NS: Final = 50_000_000
+"""How often receipts are handed in, so that a crash costs few."""
 RECEIPT_BATCH: Final = 400
 DRAIN_S: Final = 0.005
 PARTING_TICKS: Final = 600
@@ -224,9 +225,9 @@ class Host:
         clock = self.clocks[node]
         body = Telemetry(
             steps=self.steppers[node].steps,
-            lateness_us=_quantiles(clock.lateness),
-            work_us=_quantiles(clock.work),
-            latency_us=_quantiles(clock.latency),
+            lateness_us=np.array(clock.lateness.recent(), np.float32),
+            work_us=np.array(clock.work.recent(), np.float32),
+            latency_us=np.array(clock.latency.recent(), np.float32),
             cpu_s=time.process_time(),
         )
         return self._own_frame("node.telemetry", node, body)
@@ -253,11 +254,6 @@ class Host:
         self.control.close()
         self.port.close()
         self.context.term()
-
-
-def _quantiles(histogram: Histogram) -> np.ndarray[Any, np.dtype[np.float32]]:
-    summary = histogram.summary()
-    return np.array(list(summary.values()) or [0.0] * 4, np.float32)
 
 
 def main(name: str, layout: Layout) -> None:

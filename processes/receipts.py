@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -22,36 +23,39 @@ class ReceiptBook:
         self._name = name
         self._streams: list[Stream] = []
         self._index: dict[Stream, int] = {}
-        self._entries: list[tuple[int, int, int]] = []
+        self._columns = (array("B"), array("I"), array("I"))
         self._first = 0
         self._seq = 0
 
     def __len__(self) -> int:
-        return len(self._entries)
+        return len(self._columns[0])
 
     def add(self, step: Step) -> None:
         index = self._index.get(step.stream)
         if index is None:
             index = self._index[step.stream] = len(self._streams)
             self._streams.append(step.stream)
-        self._entries.append((index, step.seq, step.digest))
+        streams, seqs, digests = self._columns
+        streams.append(index)
+        seqs.append(step.seq)
+        digests.append(step.digest)
 
     def frame(self, t: int) -> bytes:
         """The receipts since the last call as one frame stamped `t`."""
-        entries = np.array(self._entries, np.int64).reshape(-1, 3)
+        streams, seqs, digests = self._columns
         body = Receipt(
             first_step=self._first,
             streams="\n".join(
                 f"{topic} {source} {epoch}" for topic, source, epoch in self._streams
             ),
-            stream=entries[:, 0].astype(np.uint8),
-            seq=entries[:, 1].astype(np.uint32),
-            digest=entries[:, 2].astype(np.uint32),
+            stream=np.frombuffer(streams, np.uint8),
+            seq=np.frombuffer(seqs, np.uint32),
+            digest=np.frombuffer(digests, np.uint32),
         )
         frame = CODECS["node.receipt"].encode(self._name, 0, self._seq, t, body)
-        self._first += len(self._entries)
+        self._first += len(streams)
         self._seq += 1
-        self._entries.clear()
+        self._columns = (array("B"), array("I"), array("I"))
         return frame
 
 

@@ -27,12 +27,11 @@ from vibrissa.messages.types import (
     WhiskCalibration,
     WhiskCycle,
 )
-from vibrissa.numerics import cos, sin
+from vibrissa.numerics import cos, philox_normal, sin
 from vibrissa.processes.arm import ARM_TICKS
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.node import Output
 from vibrissa.processes.results import RunError
-from vibrissa.rig._placeholder_noise import philox_normal
 from vibrissa.slam import tactile
 from vibrissa.slam.angles import wrap_pi
 from vibrissa.slam.config import PRESETS, ConfigError, RatSlamConfig

@@ -2,35 +2,51 @@
 
 from __future__ import annotations
 
-import numpy as np
-import numpy.typing as npt
+import bisect
+import itertools
 
 _BINS = 20_000
 """1 us bins up to 20 ms; the last bin holds everything later."""
 
 
 class Histogram:
-    """Counts of durations in us, exact to 1 us up to 20 ms, with the exact maximum."""
+    """Counts of durations in us, exact to 1 us up to 20 ms, with the exact maximum.
+
+    `add` and `recent` are for the loop; `quantile` takes milliseconds and is for afterwards.
+    """
 
     def __init__(self) -> None:
-        self.counts: npt.NDArray[np.uint32] = np.zeros(_BINS + 1, np.uint32)
+        self.counts = [0] * (_BINS + 1)
         self.largest = 0.0
+        self._total = 0.0
+        self._number = 0
+        self._peak = 0.0
 
     def add(self, microseconds: float) -> None:
-        self.counts[min(max(int(microseconds), 0), _BINS)] += 1
+        index = int(microseconds)
+        self.counts[0 if index < 0 else index if index < _BINS else _BINS] += 1
         self.largest = max(self.largest, microseconds)
+        self._total += microseconds
+        self._number += 1
+        self._peak = max(self._peak, microseconds)
+
+    def recent(self) -> tuple[float, float]:
+        """(mean, largest) in us since the last call; (0, 0) when nothing was measured."""
+        mean, peak = self._total / max(self._number, 1), self._peak
+        self._total, self._number, self._peak = 0.0, 0, 0.0
+        return mean, peak
 
     def quantile(self, q: float) -> float:
         """The duration below which a share q of all lies (upper edge of its bin); nan if empty."""
-        total = int(self.counts.sum())
+        total = sum(self.counts)
         if total == 0:
             return float("nan")
-        index = int(np.searchsorted(np.cumsum(self.counts), q * total))
+        index = bisect.bisect_left(list(itertools.accumulate(self.counts)), q * total)
         return self.largest if index >= _BINS else min(float(index + 1), self.largest)
 
     def summary(self) -> dict[str, float]:
         """p50, p99, p99.9 and max in us; empty when nothing was measured."""
-        if not self.counts.any():
+        if not any(self.counts):
             return {}
         return {
             "p50": self.quantile(0.5),

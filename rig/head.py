@@ -1,8 +1,8 @@
 """One tick of the simulated head: eighteen servos, shafts and sensors in one compiled call.
 
-Order within a tick: command, servo, contact, vibration, sensor. The contact moment of one tick
-pushes on the servo in the next. Nothing here draws from a sequence: noise is a function of (seed,
-whisker and channel, tick), so a skipped computation never shifts it.
+Order within a tick: servo, contact, vibration, sensor. The contact moment of one tick pushes on
+the servo in the next. Nothing here draws from a sequence: noise is a function of (seed, whisker,
+tick), so a skipped computation never shifts it.
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.numerics import atan2, compiled, cos, sin
-from vibrissa.rig._placeholder_noise import philox_normal
+from vibrissa.numerics import atan2, compiled, cos, philox_normals4, sin
 from vibrissa.rig.scene import GRID_TOP, TOP, index_cell
 from vibrissa.rig.whisker import (
     INERTIA,
@@ -27,9 +26,9 @@ from vibrissa.rig.whisker import (
     RING_VV,
     SHAFT_ROWS,
     TAPER,
+    TIP_SLIP,
     WEIGHT,
     bending_stiffness,
-    chord_length,
     side_extent,
     slice_box,
     wall_angles,
@@ -87,7 +86,7 @@ TICK = 0.0005  # s
 DRIFT_TICKS = 200
 LEAST_DROP = 0.001  # m, a pivot is taken to be at least this far above a wall's top
 QUIET = 1e-14  # N m, where a vibration has died away
-STREAMS_OF_DRIFT = 64  # first noise stream of the drift; those below belong to the samples
+DRIFT_STREAM = 32  # first noise stream of the drift; those below are the whiskers' samples
 
 OK, COMMAND_NOT_FINITE, POSE_OUT_OF_RANGE = range(3)
 POSE_LIMIT = 1e4
@@ -126,6 +125,7 @@ def touch(
     angle from straight down, rad. With ``skip`` only boxes the index names are looked at.
     """
     length, taper = head[LENGTH, i], head[TAPER, i]
+    chord = length / (1.0 + head[TIP_SLIP, i] * state[BEND, i])  # of the whisker as it is bent
     psi, gamma, bend = state[PSI, i], state[GAMMA, i], state[BEND, i]
     peg, side_box, side = int(state[PEG, i]), int(state[SIDE_BOX, i]), state[SIDE, i]
     depth = state[SIDE_DEPTH, i]
@@ -146,7 +146,6 @@ def touch(
                 first, last = starts[cell], starts[cell + 1]
 
     if not clear_of(length, lowest, pz):
-        chord = chord_length(length, taper, bend if peg == floor else 0.0)
         if chord > pz:
             low, low_box = atan2(math.sqrt(chord * chord - pz * pz), pz), floor
 
@@ -162,20 +161,20 @@ def touch(
         if near >= far or near >= length:
             continue
         own = b == peg
-        inner, outer, edge = wall_angles(length, taper, drop, near, far, bend if own else 0.0)
+        inner, outer, edge = wall_angles(chord, drop, near, far)
         above = psi >= outer
         if own:
             above = gamma > 0.0
             if inner >= outer:
                 # Slipped off: the straight whisker is now on the wall's other side.
-                inner, outer, edge = wall_angles(length, taper, drop, near, far, 0.0)
+                inner, outer, edge = wall_angles(length, drop, near, far)
                 above = not above
         elif inner < psi < outer:
             # The head carried the wall into the whisker: the shortest way out is the way it came.
             out = min(outer - psi, psi - inner)
             s, c = sin(psi), cos(psi)
             if s > 0.0:
-                left, _, right, _ = side_extent(box, px, py, ux, uy, drop * s / c, length * s)
+                left, _, right, _ = side_extent(box, px, py, ux, uy, drop * s / c, chord * s)
                 if left > 0.0:
                     toward = side
                     if toward == 0.0:
@@ -192,7 +191,7 @@ def touch(
             if outer > low or (outer == low and b < low_box):
                 low, low_box, low_edge = outer, b, edge
                 low_far, low_x, low_drop = far, far_x, drop
-        elif inner < high or (inner == high and b < high_box):
+        elif -NO_WALL < inner < high or (inner == high and b < high_box):
             high, high_box, high_x = inner, b, near_x
 
     psi, peg = phi, -1
@@ -203,28 +202,26 @@ def touch(
 
     if grab >= 0:
         side, side_box = grab_side, grab
-    moment_x, turn_x = 0.0, 0.0
+    moment_x, turn_square = 0.0, 0.0
     if side != 0.0:
         box = boxes[side_box]
         drop = max(pz - box[TOP], LEAST_DROP)
         s, c = sin(psi), cos(psi)
         depth, u = 0.0, 0.0
         if s > 0.0:
-            chord = chord_length(length, taper, bend)
-            left, left_u, right, right_u = side_extent(
-                box, px, py, ux, uy, drop * s / c, chord * s
-            )
+            left, left_u, right, right_u = side_extent(box, px, py, ux, uy, drop * s / c, chord * s)
             depth, u = (left, left_u) if side > 0.0 else (-right, right_u)
         if 0.0 < depth < length:
             arm = min(max(u / s, LEAST_ARM * length), length)
-            turn_x = side * depth / arm
-            moment_x = bending_stiffness(head[RIGIDITY, i], taper, arm) * turn_x
+            turn = side * depth / arm
+            turn_square = turn * turn
+            moment_x = bending_stiffness(head[RIGIDITY, i], taper, arm) * turn
         else:
             # Slipped off, or left alone. If the straight whisker is still in the wall's way, it
             # now rests on its top or hangs behind it, whichever is nearer.
             near, far, near_x, far_x = slice_box(box, px, py, ux, uy)
-            if near < far and near < length and drop < length:
-                inner, outer, edge = wall_angles(length, taper, drop, near, far, 0.0)
+            if grab < 0 and near < far and near < length and drop < length:
+                inner, outer, edge = wall_angles(length, drop, near, far)
                 if inner < psi < outer:
                     peg = side_box
                     if outer - psi <= psi - inner:
@@ -235,7 +232,7 @@ def touch(
             side, side_box, depth = 0.0, -1, 0.0
 
     gamma = psi - phi
-    moment_y, turn_y = 0.0, 0.0
+    moment_y = 0.0
     if peg >= 0:
         arm = length
         across, along, lever = 0.0, 1.0, 1.0
@@ -254,20 +251,18 @@ def touch(
         # oblique wall turns part of gamma sideways.
         across *= lever
         share = along / (along * along + across * across)
-        turn_y = gamma * along * share
-        turn_peg_x = gamma * across * share
-        turn_x += turn_peg_x
+        turn_square += gamma * gamma * along * share
         stiffness = bending_stiffness(head[RIGIDITY, i], taper, max(arm, LEAST_ARM * length))
-        moment_y = stiffness * turn_y
-        moment_x += stiffness * turn_peg_x
+        moment_y = stiffness * gamma * along * share
+        moment_x += stiffness * gamma * across * share
 
     if peg != old_peg or side_box != old_side_box:
         state[RING_Y, i] += state[MOMENT_Y, i] - moment_y
         state[RING_X, i] += state[MOMENT_X, i] - moment_x
-        if peg != old_peg:
-            bend = 0.0
+    if gamma * state[GAMMA, i] < 0.0:
+        bend = 0.0
     if peg >= 0 or side != 0.0:
-        bend += 0.5 * (turn_y * turn_y + turn_x * turn_x - bend)
+        bend += 0.5 * (turn_square - bend)
     else:
         bend = 0.0
     state[PSI, i], state[GAMMA, i], state[BEND, i] = psi, gamma, bend
@@ -277,26 +272,94 @@ def touch(
 
 
 @compiled
-def vibrate(
-    state: NDArray[np.float64], i: int, q: int, head: NDArray[np.float64]
+def drive(
+    state: NDArray[np.float64],
+    head: NDArray[np.float64],
+    command: NDArray[np.float32],
+    silent: bool,
+    acceleration: NDArray[np.float64],
 ) -> None:
-    """Advance the first mode in rows q, q + 1 of whisker i by one tick."""
-    a, v = state[q, i], state[q + 1, i]
-    if a == 0.0 and v == 0.0:
-        return
-    state[q, i] = head[RING_QQ, i] * a + head[RING_QV, i] * v
-    state[q + 1, i] = head[RING_VQ, i] * a + head[RING_VV, i] * v
-    if abs(state[q, i]) < QUIET and abs(state[q + 1, i]) < QUIET:
-        state[q, i] = 0.0
-        state[q + 1, i] = 0.0
+    """Advance every servo by one tick; acceleration float64[18], rad/s^2, is filled in."""
+    for i in range(state.shape[1]):
+        low, high = head[THETA_LOW, i], head[THETA_HIGH, i]
+        aim = state[COMMAND, i]
+        if silent:
+            step = head[RETRACT_STEP, i]
+            aim -= min(max(aim, -step), step)
+        else:
+            aim = min(max(float(command[i]), low), high)
+        state[COMMAND, i] = aim
+
+        target = aim - state[MOMENT_Y, i] * head[COMPLIANCE, i]
+        old_theta, old_omega = state[THETA, i], state[OMEGA, i]
+        e = old_theta - target
+        theta = target + head[SERVO_EE, i] * e + head[SERVO_EW, i] * old_omega
+        omega = head[SERVO_WE, i] * e + head[SERVO_WW, i] * old_omega
+        limit = head[SPEED_LIMIT, i]
+        if abs(omega) > limit or abs(theta - old_theta) > limit * TICK:
+            omega = math.copysign(limit, theta - old_theta)
+            theta = old_theta + omega * TICK
+        if theta < low or theta > high:
+            theta = min(max(theta, low), high)
+            omega = 0.0
+        state[THETA, i], state[OMEGA, i] = theta, omega
+        acceleration[i] = (omega - old_omega) / TICK
+
+
+@compiled
+def vibrate(state: NDArray[np.float64], head: NDArray[np.float64]) -> None:
+    """Advance the first mode of every shaft, in both directions, by one tick."""
+    for q in (RING_X, RING_Y):
+        for i in range(state.shape[1]):
+            a, v = state[q, i], state[q + 1, i]
+            b = head[RING_QQ, i] * a + head[RING_QV, i] * v
+            w = head[RING_VQ, i] * a + head[RING_VV, i] * v
+            # Died away: subnormal numbers would be slow.
+            rings = abs(b) >= QUIET or abs(w) >= QUIET
+            state[q, i] = b if rings else 0.0
+            state[q + 1, i] = w if rings else 0.0
 
 
 @compiled
 def measured(moment: float, full_scale: float, resolution: float) -> float:
     """A base moment as the sensor reports it: rounded to counts and clipped, N m."""
-    if resolution > 0.0:
-        moment = math.floor(moment / resolution + 0.5) * resolution
+    counts = np.floor(moment / max(resolution, 1e-30) + 0.5)
+    moment = counts * resolution if resolution > 0.0 else moment
     return min(max(moment, -full_scale), full_scale)
+
+
+@compiled
+def sense(
+    state: NDArray[np.float64],
+    head: NDArray[np.float64],
+    acceleration: NDArray[np.float64],
+    seed: int,
+    tick: int,
+    theta_out: NDArray[np.float32],
+    x_out: NDArray[np.float32],
+    y_out: NDArray[np.float32],
+) -> None:
+    """Sample every encoder and deflection sensor into float32[18], rad and N m."""
+    whiskers = state.shape[1]
+    if tick % DRIFT_TICKS == 0:
+        for i in range(whiskers):
+            walk_x, walk_y, _, _ = philox_normals4(seed, DRIFT_STREAM + i, tick)
+            state[DRIFT_X, i] += head[DRIFT_STEP, i] * walk_x
+            state[DRIFT_Y, i] += head[DRIFT_STEP, i] * walk_y
+    noise = np.empty((3, whiskers), dtype=np.float64)
+    for i in range(whiskers):
+        noise[0, i], noise[1, i], noise[2, i], _ = philox_normals4(seed, i, tick)
+    for i in range(whiskers):
+        x = state[MOMENT_X, i] + state[RING_X, i]
+        y = state[MOMENT_Y, i] + state[RING_Y, i] + head[INERTIA, i] * acceleration[i]
+        y -= head[WEIGHT, i] * sin(head[PHI_START, i] - state[THETA, i])
+        mixed_x = x + head[CROSS_TALK, i] * y + state[DRIFT_X, i]
+        mixed_y = y + head[CROSS_TALK, i] * x + state[DRIFT_Y, i]
+        mixed_x += head[SENSOR_NOISE, i] * noise[1, i]
+        mixed_y += head[SENSOR_NOISE, i] * noise[2, i]
+        theta_out[i] = state[THETA, i] + head[ENCODER_NOISE, i] * noise[0, i]
+        x_out[i] = measured(mixed_x, head[FULL_SCALE, i], head[RESOLUTION, i])
+        y_out[i] = measured(mixed_y, head[FULL_SCALE, i], head[RESOLUTION, i])
 
 
 @compiled
@@ -333,34 +396,12 @@ def head_step(
         for i in range(whiskers):
             if not math.isfinite(command[i]):
                 return COMMAND_NOT_FINITE
+    acceleration = np.empty(whiskers, dtype=np.float64)
+    drive(state, head, command, silent, acceleration)
     cos_yaw, sin_yaw = cos(pose[3]), sin(pose[3])
     for i in range(whiskers):
-        low, high = head[THETA_LOW, i], head[THETA_HIGH, i]
-        aim = state[COMMAND, i]
-        if silent:
-            step = head[RETRACT_STEP, i]
-            aim -= min(max(aim, -step), step)
-        else:
-            aim = min(max(float(command[i]), low), high)
-        state[COMMAND, i] = aim
-
-        target = aim - state[MOMENT_Y, i] * head[COMPLIANCE, i]
-        old_theta, old_omega = state[THETA, i], state[OMEGA, i]
-        e = old_theta - target
-        theta = target + head[SERVO_EE, i] * e + head[SERVO_EW, i] * old_omega
-        omega = head[SERVO_WE, i] * e + head[SERVO_WW, i] * old_omega
-        limit = head[SPEED_LIMIT, i]
-        if abs(omega) > limit or abs(theta - old_theta) > limit * TICK:
-            omega = math.copysign(limit, theta - old_theta)
-            theta = old_theta + omega * TICK
-        if theta < low or theta > high:
-            theta = min(max(theta, low), high)
-            omega = 0.0
-        state[THETA, i], state[OMEGA, i] = theta, omega
-
         ux = cos_yaw * head[AZIMUTH_COS, i] - sin_yaw * head[AZIMUTH_SIN, i]
         uy = sin_yaw * head[AZIMUTH_COS, i] + cos_yaw * head[AZIMUTH_SIN, i]
-        phi = head[PHI_START, i] - theta
         touch(
             state,
             i,
@@ -375,24 +416,8 @@ def head_step(
             max(pose[2] + head[PIVOT_HEIGHT, i], LEAST_DROP),
             ux,
             uy,
-            phi,
+            head[PHI_START, i] - state[THETA, i],
         )
-        vibrate(state, i, RING_X, head)
-        vibrate(state, i, RING_Y, head)
-
-        if head[DRIFT_STEP, i] > 0.0 and tick % DRIFT_TICKS == 0:
-            stream = STREAMS_OF_DRIFT + 2 * i
-            state[DRIFT_X, i] += head[DRIFT_STEP, i] * philox_normal(seed, stream, tick)
-            state[DRIFT_Y, i] += head[DRIFT_STEP, i] * philox_normal(seed, stream + 1, tick)
-        noise = head[SENSOR_NOISE, i]
-        x = state[MOMENT_X, i] + state[RING_X, i]
-        y = state[MOMENT_Y, i] + state[RING_Y, i] - head[WEIGHT, i] * sin(phi)
-        y += head[INERTIA, i] * (omega - old_omega) / TICK
-        mixed_x = x + head[CROSS_TALK, i] * y + state[DRIFT_X, i]
-        mixed_y = y + head[CROSS_TALK, i] * x + state[DRIFT_Y, i]
-        mixed_x += noise * philox_normal(seed, 3 * i + 1, tick)
-        mixed_y += noise * philox_normal(seed, 3 * i + 2, tick)
-        theta_out[i] = theta + head[ENCODER_NOISE, i] * philox_normal(seed, 3 * i, tick)
-        x_out[i] = measured(mixed_x, head[FULL_SCALE, i], head[RESOLUTION, i])
-        y_out[i] = measured(mixed_y, head[FULL_SCALE, i], head[RESOLUTION, i])
+    vibrate(state, head)
+    sense(state, head, acceleration, seed, tick, theta_out, x_out, y_out)
     return OK

@@ -132,9 +132,7 @@ def head_table(params: HeadPlantParams) -> Float64s:
     table[h.PHI_START] = g.phi_start
     table[h.THETA_LOW] = -params.stop_margin
     table[h.THETA_HIGH] = g.swing + params.stop_margin
-    servo = second_order_step(
-        2 * math.pi * params.servo_frequency, params.servo_damping, h.TICK
-    )
+    servo = second_order_step(2 * math.pi * params.servo_frequency, params.servo_damping, h.TICK)
     table[h.SERVO_EE : h.SERVO_WW + 1] = np.array(servo)[:, None]
     table[h.COMPLIANCE] = 1.0 / params.servo_stiffness
     table[h.SPEED_LIMIT] = params.servo_speed
@@ -342,9 +340,7 @@ class ArmPlant:
             x, y, z, yaw = self._to
         else:
             part = (tick - begin) / ARM_PERIOD
-            x, y, z, yaw = (
-                a + (b - a) * part for a, b in zip(self._from, self._to, strict=True)
-            )
+            x, y, z, yaw = (a + (b - a) * part for a, b in zip(self._from, self._to, strict=True))
         return x, y, z, yaw
 
 
@@ -385,8 +381,8 @@ def _follow(
         slack = 1 + 1e-9
         if _norm(exact) <= speed * slack and max(change, closing) <= step * slack:
             return exact
-        approach = _stopping_speed(closing, step)
-        wanted = [d + c * approach / closing for d, c in zip(drift, catch_up, strict=True)]
+        share = _stopping_speed(closing, step) / closing if closing > 0.0 else 0.0
+        wanted = [d + c * share for d, c in zip(drift, catch_up, strict=True)]
         total = _norm(wanted)
         if total > speed:
             wanted = [w * speed / total for w in wanted]

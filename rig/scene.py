@@ -96,7 +96,9 @@ def build_scene(boxes: NDArray[np.float64], reach: float) -> Scene:
         | (boxes[:, TOP] <= 0)
     )
     if bad.size:
-        raise SceneError(f"scene box {bad[0]}: expected min < max and top > 0, found {boxes[bad[0]]}")
+        raise SceneError(
+            f"scene box {bad[0]}: expected min < max and top > 0, found {boxes[bad[0]]}"
+        )
     if not 0 < reach < 10:
         raise SceneError(f"scene reach: expected 0 to 10 m, found {reach}")
     boxes = np.ascontiguousarray(boxes, dtype=np.float64)

@@ -14,6 +14,7 @@ the pivot to the contact: `psi` is its angle from straight down.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,58 +33,37 @@ from vibrissa.rig.scene import X_MAX, X_MIN, Y_MAX, Y_MIN
     RING_QV,
     RING_VQ,
     RING_VV,
-) = range(9)
-SHAFT_ROWS = 9
+    TIP_SLIP,  # the chord to a held tip is LENGTH / (1 + TIP_SLIP gamma^2)
+) = range(10)
+SHAFT_ROWS = 10
 
 GRAVITY = 9.80665
 LEAST_ARM = 0.02  # of the length: a contact nearer than this counts as being there
-SLIP_NODES = 64
 NO_WALL = 9.0  # rad, beyond any angle
 
 
-def _slip_table() -> NDArray[np.float64]:
-    """c(q) at q = n / SLIP_NODES: half the mean square of slope over gamma, minus one.
+@lru_cache(maxsize=64)
+def slip_coefficient(q: float) -> float:
+    """c in arc length = d (1 + c gamma^2) for a contact where the diameter is q of the base's.
 
-    Midpoint rule on the slope of the tip-loaded tapered cantilever; node 0 repeats node 1.
+    Half the mean square of (slope / gamma - 1) along the loaded cantilever, by the midpoint rule.
     """
-    table = np.empty(SLIP_NODES + 1, dtype=np.float64)
     steps = 2000
-    for n in range(1, SLIP_NODES + 1):
-        q = n / SLIP_NODES
-        slope, total, step = 0.0, 0.0, 1.0 / steps
-        for k in range(steps):
-            t = (k + 0.5) * step
-            v = 1.0 - (1.0 - q) * t
-            curvature = 3.0 * q * (1.0 - t) / (v * v * v * v)
-            middle = slope + 0.5 * step * curvature
-            slope += step * curvature
-            total += step * (middle - 1.0) * (middle - 1.0)
-        table[n] = 0.5 * total
-    table[0] = table[1]
-    return table
-
-
-SLIP = _slip_table()
+    slope, total, step = 0.0, 0.0, 1.0 / steps
+    for k in range(steps):
+        t = (k + 0.5) * step
+        v = 1.0 - (1.0 - q) * t
+        curvature = 3.0 * q * (1.0 - t) / (v * v * v * v)
+        middle = slope + 0.5 * step * curvature
+        slope += step * curvature
+        total += step * (middle - 1.0) * (middle - 1.0)
+    return 0.5 * total
 
 
 @compiled
 def bending_stiffness(rigidity: float, taper: float, distance: float) -> float:
     """Base moment per angle, N m/rad, of a shaft held at ``distance`` m: 3 E I0 q / d."""
     return 3.0 * rigidity * (1.0 - taper * distance) / distance
-
-
-@compiled
-def slip_coefficient(taper: float, distance: float) -> float:
-    """c in arc length = d (1 + c gamma^2) between base and a contact ``distance`` m away."""
-    q = (1.0 - taper * distance) * SLIP_NODES
-    n = min(max(int(q), 0), SLIP_NODES - 1)
-    return SLIP[n] + (q - n) * (SLIP[n + 1] - SLIP[n])
-
-
-@compiled
-def chord_length(length: float, taper: float, bend: float) -> float:
-    """Distance base to tip, m, when the tip is held; ``bend`` is gamma^2, rad^2."""
-    return length / (1.0 + slip_coefficient(taper, length) * bend)
 
 
 @compiled
@@ -110,27 +90,21 @@ def slice_box(
 
 
 @compiled
-def wall_angles(
-    length: float, taper: float, drop: float, near: float, far: float, bend: float
-) -> tuple[float, float, bool]:
+def wall_angles(chord: float, drop: float, near: float, far: float) -> tuple[float, float, bool]:
     """Chord angles (inner, outer), rad, between which a wall section is in the whisker's way.
 
-    drop: height of the pivot above the wall's top, m; near, far: the section's extent in u, m;
-    bend: gamma^2 of the present contact with this wall, 0 if none. Third: whether the outer end is
-    the shaft on the far top edge (else the tip on the top). inner > outer: the whisker passes, too
+    chord: distance from base to tip, m, which bending shortens; drop: height of the pivot above the
+    wall's top, m; near, far: the section's extent in u, m. Third: whether the outer end is the
+    shaft on the far top edge (else the tip on the top). inner > outer: the whisker passes, too
     short or bent so far that its tip has slipped over the near edge.
     """
-    chord = chord_length(length, taper, bend)
     inner = -NO_WALL
+    if near * near + drop * drop >= chord * chord:
+        return NO_WALL, -NO_WALL, False
     if near > 0.0:
-        if near * near + drop * drop >= chord * chord:
-            return NO_WALL, -NO_WALL, False
-        inner = atan2(near, math.sqrt(max(chord * chord - near * near, 0.0)))
-    edge = math.sqrt(far * far + drop * drop)
-    if edge * (1.0 + slip_coefficient(taper, edge) * bend) < length:
+        inner = atan2(near, math.sqrt(chord * chord - near * near))
+    if far * far + drop * drop < chord * chord:
         return inner, atan2(far, drop), True
-    if chord <= drop:
-        return inner, max(inner, 0.0), False
     return inner, atan2(math.sqrt(chord * chord - drop * drop), drop), False
 
 
@@ -181,6 +155,7 @@ def side_extent(
     return left, left_u, right, right_u
 
 
+@lru_cache(maxsize=64)
 def first_mode(length: float, base: float, tip: float, modulus: float, density: float) -> float:
     """First natural frequency, rad/s, of the tapered cantilever, by Stodola's iteration.
 
@@ -254,7 +229,7 @@ def shaft_table(
     damping: float,
     dt: float,
 ) -> NDArray[np.float64]:
-    """The rows LENGTH .. RING_VV, float64[SHAFT_ROWS, n], of n shafts.
+    """The rows LENGTH .. TIP_SLIP, float64[SHAFT_ROWS, n], of n shafts.
 
     length, base and tip diameter float64[n] in m; modulus Pa; density kg/m^3; damping: ratio of
     the first mode; dt: tick in s.
@@ -273,5 +248,6 @@ def shaft_table(
         table[WEIGHT, i] = GRAVITY * mass_per_length * l * l * (1 / 2 + 2 * r / 3 + r * r / 4)
         table[INERTIA, i] = mass_per_length * l**3 * (1 / 3 + 2 * r / 4 + r * r / 5)
         omega = first_mode(l, d0, d1, modulus, density)
+        table[TIP_SLIP, i] = slip_coefficient(d1 / d0)
         table[RING_QQ : RING_VV + 1, i] = second_order_step(omega, damping, dt)
     return table

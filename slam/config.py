@@ -85,7 +85,7 @@ class RatSlamConfig:
                 isinstance(value, bool) and str(field.type) != "bool"
             ):
                 raise ConfigError(f"{field.name}: expected {field.type}, found {value!r}")
-            if not math.isfinite(float(value)):
+            if not math.isfinite(float(getattr(self, field.name))):
                 raise ConfigError(f"{field.name}: expected a finite number, found {value}")
         for name in _POSITIVE:
             if getattr(self, name) <= 0:

@@ -226,18 +226,42 @@ class ExperienceMap:
 def _relax(
     poses: Floats, source: Ints, target: Ints, values: Floats, loops: int, correction: float
 ) -> None:
+    """Sweeps over the links, each correcting its two ends at once (Gauss-Seidel).
+
+    Headings do not depend on positions. A sweep therefore corrects all headings first, keeps the
+    direction in which each link was found, and takes the sines and cosines of all of them together.
+    """
+    links = source.shape[0]
+    distance = values[:, 0].copy()
+    heading = values[:, 1].copy()
+    facing = values[:, 2].copy()
+    x = poses[:, 0].copy()
+    y = poses[:, 1].copy()
+    th = poses[:, 2].copy()
+    direction = np.empty(links)
+    ahead_x = np.empty(links)
+    ahead_y = np.empty(links)
     for _ in range(loops):
-        for link in range(source.shape[0]):
+        for link in range(links):
             a = source[link]
             b = target[link]
-            distance = values[link, 0]
-            direction = poses[a, 2] + values[link, 1]
-            dx = (poses[b, 0] - poses[a, 0] - distance * cos(direction)) * correction
-            dy = (poses[b, 1] - poses[a, 1] - distance * sin(direction)) * correction
-            poses[a, 0] += dx
-            poses[a, 1] += dy
-            poses[b, 0] -= dx
-            poses[b, 1] -= dy
-            twist = turn(poses[a, 2] + values[link, 2], poses[b, 2]) * correction
-            poses[a, 2] = wrap_pi(poses[a, 2] + twist)
-            poses[b, 2] = wrap_pi(poses[b, 2] - twist)
+            direction[link] = th[a] + heading[link]
+            twist = turn(th[a] + facing[link], th[b]) * correction
+            th[a] = wrap_pi(th[a] + twist)
+            th[b] = wrap_pi(th[b] - twist)
+        for link in range(links):
+            ahead_x[link] = distance[link] * cos(direction[link])
+        for link in range(links):
+            ahead_y[link] = distance[link] * sin(direction[link])
+        for link in range(links):
+            a = source[link]
+            b = target[link]
+            dx = (x[b] - x[a] - ahead_x[link]) * correction
+            dy = (y[b] - y[a] - ahead_y[link]) * correction
+            x[a] += dx
+            y[a] += dy
+            x[b] -= dx
+            y[b] -= dy
+    poses[:, 0] = x
+    poses[:, 1] = y
+    poses[:, 2] = th

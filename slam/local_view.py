@@ -6,8 +6,9 @@ the original, templates whose mean differs by more than the threshold + 0.005 ar
 
 The search is exact and skips what cannot win: templates are kept in buckets of equal mean, from
 which the search walks outwards while the difference of the means (a lower bound of the error when
-nothing is shifted out of the image) can still win; within a bucket the difference of the column
-sums is a second lower bound, computed for a block of templates at once.
+nothing is shifted out of the image) can still win. Within a bucket, blocks of templates lie pixel
+by pixel side by side: the difference of the column sums is a second lower bound and the difference
+in single precision a third, each computed for the whole block at once.
 """
 
 from __future__ import annotations
@@ -27,7 +28,12 @@ from vibrissa.slam.template import Image, Template, TemplateBuilder, mean_value
 
 MEAN_TOLERANCE: Final = 0.005
 BUCKETS: Final = 1024
-LANES: Final = 64
+SMALL_TEMPLATE: Final = 64
+LANES_SMALL: Final = 64
+LANES_LARGE: Final = 16
+"""Templates per block: many of few pixels, few of many."""
+FEW: Final = 4
+"""Candidates of a block from which on the single-precision costs are worth computing."""
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -60,13 +66,15 @@ class LocalView:
         self._means = np.zeros(64, dtype=np.float64)
         self._count = 0
         self._last = -1
-        # blocks of LANES templates of one bucket, chained from `first` to `last`
+        self._lanes = LANES_SMALL if rows * columns <= SMALL_TEMPLATE else LANES_LARGE
+        # blocks of templates of one bucket, chained from `first` to `last`
         self._first = np.full(BUCKETS, -1, dtype=np.int64)
         self._tail = np.full(BUCKETS, -1, dtype=np.int64)
         self._next = np.full(16, -1, dtype=np.int64)
         self._filled = np.zeros(16, dtype=np.int64)
-        self._ids = np.zeros((16, LANES), dtype=np.int64)
-        self._sums = np.zeros((16, columns, LANES), dtype=np.float32)
+        self._ids = np.zeros((16, self._lanes), dtype=np.int64)
+        self._sums = np.zeros((16, columns, self._lanes), dtype=np.float32)
+        self._pixels = np.zeros((16, rows, columns, self._lanes), dtype=np.float32)
         self._blocks = 0
 
     def __len__(self) -> int:
@@ -119,6 +127,7 @@ class LocalView:
             self._filled,
             self._ids,
             self._sums,
+            self._pixels,
             tolerance,
             0 if c.vt_panoramic else c.vt_shift_match,
             c.vt_step_match,
@@ -142,11 +151,12 @@ class LocalView:
         self._count += 1
         bucket = _bucket(mean)
         block = int(self._tail[bucket])
-        if block < 0 or self._filled[block] == LANES:
+        if block < 0 or self._filled[block] == self._lanes:
             block = self._new_block(bucket)
         lane = int(self._filled[block])
         self._ids[block, lane] = new
         self._sums[block, :, lane] = template.sum(axis=0)
+        self._pixels[block, :, :, lane] = template
         self._filled[block] += 1
 
     def _new_block(self, bucket: int) -> int:
@@ -156,6 +166,7 @@ class LocalView:
         self._filled = grown(self._filled, block + 1)
         self._ids = grown(self._ids, block + 1)
         self._sums = grown(self._sums, block + 1)
+        self._pixels = grown(self._pixels, block + 1)
         self._next[block] = -1
         self._filled[block] = 0
         tail = int(self._tail[bucket])
@@ -213,6 +224,67 @@ def _best_shift(
 
 
 @compiled
+def _column_bounds(
+    view_sums: Floats32,
+    sums: Floats32,
+    used: int,
+    margin: int,
+    step: int,
+    panoramic: bool,
+    partial: Floats32,
+    bound: Floats32,
+) -> None:
+    """Difference of the column sums at the best shift, for every lane of a block."""
+    columns = view_sums.shape[0]
+    compared = columns if panoramic else columns - 2 * margin
+    shifts = columns if panoramic else 2 * margin + 1
+    bound[:used] = np.float32(np.inf)
+    for offset in range(0, shifts, step):
+        partial[:used] = np.float32(0.0)
+        for x in range(compared):
+            mine = view_sums[margin + x]
+            theirs = sums[(x + offset) % columns]
+            for lane in range(used):
+                partial[lane] += abs(mine - theirs[lane])
+        for lane in range(used):
+            bound[lane] = min(bound[lane], partial[lane])
+
+
+@compiled
+def _pixel_bounds(
+    view: Floats32,
+    pixels: Floats32,
+    used: int,
+    margin: int,
+    step: int,
+    panoramic: bool,
+    limit: float,
+    partial: Floats32,
+    bound: Floats32,
+) -> None:
+    """Cost in single precision at the best shift, for every lane; given up above `limit`."""
+    rows, columns = view.shape
+    compared = columns if panoramic else columns - 2 * margin
+    shifts = columns if panoramic else 2 * margin + 1
+    bound[:used] = np.float32(np.inf)
+    for offset in range(0, shifts, step):
+        partial[:used] = np.float32(0.0)
+        for y in range(rows):
+            for x in range(compared):
+                mine = view[y, margin + x]
+                theirs = pixels[y, (x + offset) % columns]
+                for lane in range(used):
+                    partial[lane] += abs(mine - theirs[lane])
+            least = np.float32(np.inf)
+            for lane in range(used):
+                least = min(least, partial[lane])
+            if least > limit:
+                break
+        for lane in range(used):
+            bound[lane] = min(bound[lane], partial[lane])
+
+
+@compiled
 def _search(
     view: Template,
     mean: float,
@@ -223,6 +295,7 @@ def _search(
     filled: Ints,
     ids: NDArray[np.int64],
     sums: NDArray[np.float32],
+    pixels: NDArray[np.float32],
     tolerance: float,
     margin: int,
     step: int,
@@ -231,12 +304,12 @@ def _search(
 ) -> tuple[int, float, int]:
     """The (cost, id)-smallest template with a mean within tolerance; -1 when there is none."""
     rows, columns = view.shape
-    pixels = rows * columns
+    size = rows * columns
     whole = panoramic or margin == 0
-    shifts = columns if panoramic else 2 * margin + 1
-    compared = columns if panoramic else columns - 2 * margin
-    # what rounding in single precision can add to a lower bound
-    slack = (columns + 4) * pixels * 1.2e-7
+    # what rounding in single precision can add to the lower bounds
+    column_slack = (columns + 4) * size * 1.2e-7
+    pixel_slack = (size + 4) * 1.2e-7
+    view32 = view.astype(np.float32)
     view_sums = np.zeros(columns, dtype=np.float32)
     for x in range(columns):
         total = 0.0
@@ -247,8 +320,8 @@ def _search(
     if hint >= 0 and abs(mean - means[hint]) <= tolerance:
         least, shift = _best_shift(view, templates[hint], margin, step, panoramic, np.inf)
         found = hint
-    bound = np.empty(LANES, dtype=np.float32)
-    partial = np.empty(LANES, dtype=np.float32)
+    bound = np.empty(ids.shape[1], dtype=np.float32)
+    partial = np.empty(ids.shape[1], dtype=np.float32)
     home = _bucket(mean)
     low = _bucket(mean - tolerance - 1e-9)
     high = _bucket(mean + tolerance + 1e-9)
@@ -259,31 +332,36 @@ def _search(
             continue
         if whole and away > 0:
             gap = bucket / BUCKETS - mean if bucket > home else mean - (bucket + 1) / BUCKETS
-            if (gap - 1e-9) * pixels > least:
+            if (gap - 1e-9) * size > least:
                 continue
         block = first[bucket]
         while block >= 0:
             used = filled[block]
+            _column_bounds(view_sums, sums[block], used, margin, step, panoramic, partial, bound)
+            slack, growth = column_slack, 0.0
+            survivors = 0
             for lane in range(used):
-                bound[lane] = np.float32(np.inf)
-            for offset in range(0, shifts, step):
-                for lane in range(used):
-                    partial[lane] = np.float32(0.0)
-                for x in range(compared):
-                    mine = view_sums[margin + x]
-                    column = (x + offset) % columns
-                    theirs = sums[block, column]
-                    for lane in range(used):
-                        partial[lane] += abs(mine - theirs[lane])
-                for lane in range(used):
-                    bound[lane] = min(bound[lane], partial[lane])
+                survivors += bound[lane] <= least + slack
+            if survivors > FEW:
+                slack, growth = pixel_slack, pixel_slack
+                _pixel_bounds(
+                    view32,
+                    pixels[block],
+                    used,
+                    margin,
+                    step,
+                    panoramic,
+                    least * (1.0 + growth) + slack,
+                    partial,
+                    bound,
+                )
             nearest = 0
             for lane in range(1, used):
                 if bound[lane] < bound[nearest]:
                     nearest = lane
             for turn in range(-1, used):
                 lane = nearest if turn < 0 else turn
-                if turn == nearest or bound[lane] > least + slack:
+                if turn == nearest or bound[lane] > least * (1.0 + growth) + slack:
                     continue
                 candidate = ids[block, lane]
                 if candidate == hint or abs(mean - means[candidate]) > tolerance:

@@ -228,9 +228,8 @@ def _rates(y: Samples, fast: float, slow: float) -> Floats:
 def _pixel(theta: float, pivot_height: float, length: float, phi_start: float) -> int:
     """Tip height at protraction theta, coded 1 .. 255."""
     height = pivot_height - length * cos(phi_start - theta)
-    level = min(max(height / HIGHEST_OBSTACLE, 0.0), 1.0)
-    code = 1 + int(254.0 * level + 0.5)
-    return code
+    level: float = min(max(height / HIGHEST_OBSTACLE, 0.0), 1.0)
+    return 1 + int(254.0 * level + 0.5)
 
 
 @compiled
@@ -246,7 +245,8 @@ def _image(
     pixels: NDArray[np.uint8],
 ) -> int:
     """Fill pixels uint8[3, 18] (gated, ungated, contact angle); -1, or the first bad sample."""
-    n, whiskers = theta.shape
+    n: int = theta.shape[0]
+    whiskers = WHISKERS
     largest = np.empty(whiskers)
     touching = np.empty(whiskers)
     touched = np.empty(whiskers)

@@ -83,6 +83,7 @@ Run = Callable[[Path, float, "OnProgress"], Bench]
 BENCHES: Final[dict[str, str]] = {
     "live": "vibrissa.tools.bench_live:bench",
     "replay": "vibrissa.tools.bench_replay:bench",
+    "faults": "vibrissa.tools.bench_faults:bench",
 }
 """name -> where its function is, imported when it is asked for."""
 

@@ -28,7 +28,7 @@ from vibrissa.rig.maze import Maze, parse_maze
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from vibrissa.messages.types import SlamPose
+    from vibrissa.messages.types import SlamPose, Telemetry
     from vibrissa.processes.config import Experiment
 
 Floats = npt.NDArray[np.float64]
@@ -52,7 +52,7 @@ class Story:
     contacts: dict[int, npt.NDArray[np.bool_]] = field(default_factory=dict)
     answered: int = 0
     samples: int = 0
-    telemetry: dict[str, Any] = field(default_factory=dict)
+    telemetry: dict[str, list[Telemetry]] = field(default_factory=dict)
 
     def take(self, message: Message) -> None:
         """Add one message."""
@@ -70,7 +70,7 @@ class Story:
             case "whisk.calibration":
                 self.calibration = body
             case "node.telemetry":
-                self.telemetry[message.source] = body
+                self.telemetry.setdefault(message.source, []).append(body)
             case "head.sample":
                 self.samples += 1
                 self.answered += body.answers == body.tick - 1
@@ -238,33 +238,27 @@ def draw_contacts(ax: Axes, story: Story) -> None:
 
 
 def draw_timing(ax: Axes, story: Story) -> None:
-    """Lateness, work time and latency of each process, as its last telemetry has them."""
+    """Latency, lateness and work time of each process: median of its means per second, and max."""
     share = story.answered / story.samples if story.samples else 0.0
     ax.set_title(f"timing: {share:.2%} of {story.samples} ticks answered in time", loc="left")
     rows = [
-        (f"{node} {kind}", values)
-        for node, body in story.telemetry.items()
+        (f"{node} {kind}", float(np.median(mean[mean > 0])), float(worst.max()))
+        for node, bodies in story.telemetry.items()
         for kind in ("latency", "lateness", "work")
-        if (values := np.asarray(getattr(body, f"{kind}_us"))).any()
+        for mean, worst in [np.array([getattr(body, f"{kind}_us") for body in bodies]).T]
+        if worst.any()
     ]
     if not rows:
         ax.set_axis_off()
         ax.text(0.0, 0.5, "no wall-clock telemetry: this run did not keep real time")
         return
-    for column, (label, colour) in enumerate(
-        zip(
-            ("p50", "p99", "p99.9", "max"),
-            ("#1b9e77", "#7570b3", "#d95f02", "#999999"),
-            strict=True,
-        )
-    ):
-        ax.plot(
-            [values[column] for _, values in rows], range(len(rows)), "o", color=colour, label=label
-        )
+    names, means, worsts = zip(*rows, strict=True)
+    ax.plot(means, range(len(rows)), "o", color="tab:blue", label="mean")
+    ax.plot(worsts, range(len(rows)), "o", color="tab:red", label="max")
     ax.axvline(TICK_NS * 1e-3, color="k", lw=0.7, ls="--")
     ax.set_xscale("log")
-    ax.set_yticks(range(len(rows)), [name for name, _ in rows], fontsize=7)
+    ax.set_yticks(range(len(rows)), names, fontsize=7)
     ax.invert_yaxis()
     ax.grid(axis="x", alpha=0.3)
     ax.set_xlabel("us; dashed: one period")
-    ax.legend(fontsize=7, ncols=4, loc="lower right")
+    ax.legend(fontsize=8, ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False)

@@ -229,6 +229,7 @@ def _angle(y: float, y_low: float, x: float, x_low: float) -> float:
     if d == np.inf:
         n, d = (1.0, 1.0) if n == np.inf else (0.0, 1.0)
     d = d if d > 0.0 else 1.0
+    slope = n / d
     exponent = min(int(_bits(d) >> 52), 2045)
     scale = _from_bits((2 * _BIAS - exponent) << 52)
     n, n_low, d, d_low = n * scale, n_low * scale, d * scale, d_low * scale
@@ -258,6 +259,7 @@ def _angle(y: float, y_low: float, x: float, x_low: float) -> float:
     u = sign * u
     high = base + u
     value = high + ((u - (high - base)) + (sign * low + base_low))
+    value = slope if base == 0.0 and slope < 2.0**-900 else value  # scaling has cut n short
     return math.copysign(value, y)
 
 

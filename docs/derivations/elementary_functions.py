@@ -160,9 +160,9 @@ def derive(p: Polynomial) -> list[float]:
     return [first, *(float(c) for c in remez(narrowed, rest, p.terms - 1))]
 
 
-def largest_error(p: Polynomial, coefficients: list[float]) -> mpf:
+def largest_error(p: Polynomial, coefficients: list[float], steps: int = 2000) -> mpf:
     exact = [mpf(c) for c in coefficients]
-    points = [p.low + (p.high - p.low) * i / 2000 for i in range(2001)]
+    points = [p.low + (p.high - p.low) * i / steps for i in range(steps + 1)]
     return max(abs(p.weight(z) * (evaluate(exact, z) - p.target(z))) for z in points)
 
 

@@ -321,7 +321,10 @@ near_numbers = st.floats(-0.4, 0.4)
 @given(
     boxes=st.lists(
         st.tuples(
-            near_numbers, st.floats(1e-9, 0.5), near_numbers, st.floats(1e-9, 0.5),
+            near_numbers,
+            st.floats(1e-9, 0.5),
+            near_numbers,
+            st.floats(1e-9, 0.5),
             st.floats(1e-6, 0.5),
         ),
         max_size=5,

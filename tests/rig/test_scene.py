@@ -45,7 +45,9 @@ def test_index_names_every_box_within_reach() -> None:
         gap_y = np.maximum(np.maximum(scene.boxes[:, 2] - y, y - scene.boxes[:, 3]), 0)
         near = set(np.flatnonzero(np.hypot(gap_x, gap_y) <= reach))
         cell = index_cell(scene.grid, x, y)
-        found = set(scene.items[scene.starts[cell] : scene.starts[cell + 1]]) if cell >= 0 else set()
+        found = (
+            set(scene.items[scene.starts[cell] : scene.starts[cell + 1]]) if cell >= 0 else set()
+        )
         assert near <= found
 
 

@@ -96,7 +96,10 @@ def move(cells: np.ndarray, step: float, angle: float, corners: bool) -> np.ndar
 def read_out(cells: np.ndarray) -> tuple[float, float, float]:
     """x, y, heading of the packet around the largest cell."""
     peak = np.unravel_index(int(np.argmax(cells)), cells.shape)
-    windows = [[(p + d) % length for d in range(-3, 4)] for p, length in zip(peak, cells.shape)]
+    windows = [
+        [(p + d) % length for d in range(-3, 4)]
+        for p, length in zip(peak, cells.shape, strict=True)
+    ]
     window = cells[np.ix_(*windows)]
     result = []
     for axis, others in ((2, (0, 1)), (1, (0, 2)), (0, (1, 2))):

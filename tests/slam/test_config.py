@@ -6,8 +6,16 @@ from dataclasses import replace
 
 import pytest
 
-from vibrissa.slam.config import IRAT, OXFORD, PRESETS, WHISKER, ConfigError, RatSlamConfig
-from vibrissa.slam.config import faithful, parse_config
+from vibrissa.slam.config import (
+    IRAT,
+    OXFORD,
+    PRESETS,
+    WHISKER,
+    ConfigError,
+    RatSlamConfig,
+    faithful,
+    parse_config,
+)
 
 IRAT_FILE = """
 [general]

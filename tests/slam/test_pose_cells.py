@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.slam import oracle
-from vibrissa.slam import pose_cells as module
+from vibrissa.slam.attractor import integrate
 from vibrissa.slam.config import IRAT, WHISKER, faithful
 from vibrissa.slam.interface import SlamInputError
 from vibrissa.slam.pose_cells import PoseCellError, PoseCells
@@ -62,7 +62,7 @@ def integrated(activity, step, spin, exact):
     cells = PoseCells(replace(IRAT, faithful=exact))
     layers, n, _ = activity.shape
     moved = np.zeros_like(activity)
-    module._integrate(
+    integrate(
         moved,
         np.zeros(layers, np.uint8),
         activity.reshape(layers, n * n),
@@ -165,6 +165,17 @@ def test_an_iteration_equals_the_plain_formulas(seed, step, angle, n):
     network.on_odo(step * CELL, angle, 1.0)
     expected = oracle.move(oracle.stages(activity, 2e-5)[3], step, angle, corners=True)
     np.testing.assert_allclose(network.cells, expected, atol=1e-12)
+
+
+def test_the_read_out_equals_the_plain_formula():
+    network = PoseCells(IRAT)
+    rng = np.random.default_rng(7)
+    for _ in range(200):
+        network.on_odo(rng.uniform(-2, 2) * CELL, rng.normal(), 1.0)
+        for found, expected, length in zip(
+            network.best, oracle.read_out(network.cells), (11, 11, 36), strict=True
+        ):
+            assert (found - expected + length / 2) % length == pytest.approx(length / 2, abs=1e-9)
 
 
 @settings(max_examples=15, deadline=None)
@@ -331,7 +342,7 @@ def test_a_step_that_cannot_be_integrated_changes_nothing():
     network = settled(IRAT)
     before, best = network.cells.copy(), network.best
     for v, w in ((1e6, 0.0), (float("nan"), 0.0), (0.0, 1e9), (0.0, float("nan"))):
-        with pytest.raises(SlamInputError, match="odometry [vw]: expected at most"):
+        with pytest.raises(SlamInputError, match=r"odometry [vw]: expected at most"):
             network.on_odo(v, w, 1.0)
     assert (network.cells == before).all()
     assert network.best == best
