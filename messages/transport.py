@@ -3,6 +3,10 @@
 A `Port` is a process's side of the bus: it publishes its own frames and receives what it
 subscribed to. Both kinds keep each publisher's order, never drop a frame, and know who listens, so
 that nothing is sent before everybody can hear it.
+
+Waking a process costs more than carrying a message. Listeners that need no frame at once (the
+recorder, slam) therefore ask for bundles: a publisher sends them everything it said in the last few
+milliseconds as one message, and a frame goes out alone only to those who must react to it.
 """
 
 from __future__ import annotations
@@ -10,13 +14,19 @@ from __future__ import annotations
 import collections
 import ipaddress
 from collections.abc import Iterable, Mapping
-from typing import Protocol
+from typing import Final, Protocol
 from urllib.parse import urlparse
 
+import msgpack
 import zmq
 
 from vibrissa.messages.codec import MAX_FRAME_BYTES
-from vibrissa.messages.errors import TransportError
+from vibrissa.messages.errors import DecodeError, TransportError
+from vibrissa.messages.topics import TOPICS
+
+BUNDLE: Final = "bundle"
+"""Not a topic of the table: what a bundled listener subscribes to."""
+_BUNDLE_PREFIX: Final = b"bundle\0"
 
 
 class Port(Protocol):
@@ -24,6 +34,9 @@ class Port(Protocol):
 
     def publish(self, frame: bytes) -> None:
         """Send a frame to everybody who subscribed to its topic. Never blocks, never drops."""
+
+    def flush(self) -> None:
+        """Send what was published since the last flush to those who listen in bundles."""
 
     def receive(self, timeout: float) -> bytes | None:
         """The next frame, or None after `timeout` seconds; 0 looks without waiting."""
@@ -45,6 +58,7 @@ class ZmqPort:
         topics: Iterable[str] = (),
         connect: Iterable[str] = (),
         *,
+        bundled: bool = False,
         linger_ms: int = 2000,
     ) -> None:
         """Bind `endpoint` and subscribe to `topics` at the endpoints in `connect`.
@@ -53,6 +67,10 @@ class ZmqPort:
         """
         self._subscribers: collections.Counter[str] = collections.Counter()
         self._waited_ms = -1
+        self._topics = {topic.encode() for topic in topics}
+        self._bundled = bundled
+        self._unbundled: collections.deque[bytes] = collections.deque()
+        self._bundle: list[bytes] = []
         self._out = context.socket(zmq.XPUB)
         self._in = context.socket(zmq.SUB)
         try:
@@ -67,8 +85,8 @@ class ZmqPort:
                 self._out.bind(endpoint)
             except zmq.ZMQError as error:
                 raise TransportError(f"can't bind {endpoint}: {error.strerror}") from None
-            for topic in topics:
-                self._in.subscribe(topic.encode() + b"\0")
+            for topic in [BUNDLE.encode()] if bundled else sorted(self._topics):
+                self._in.subscribe(topic + b"\0")
             for other in connect:
                 check_endpoint(other)
                 self._in.connect(other)
@@ -77,9 +95,37 @@ class ZmqPort:
             raise
 
     def publish(self, frame: bytes) -> None:
-        self._out.send(frame, zmq.NOBLOCK)
+        if self._subscribers.get(frame[: frame.find(b"\0")].decode()):
+            self._out.send(frame, zmq.NOBLOCK)
+        if self._subscribers.get(BUNDLE):
+            self._bundle.append(frame)
+
+    def flush(self) -> None:
+        if self._bundle:
+            self._out.send(_BUNDLE_PREFIX + msgpack.packb(self._bundle), zmq.NOBLOCK)
+            self._bundle.clear()
 
     def receive(self, timeout: float) -> bytes | None:
+        if not self._bundled:
+            return self._receive(timeout)
+        while not self._unbundled:
+            bundle = self._receive(timeout)
+            if bundle is None:
+                return None
+            self._unbundle(bundle)
+        return self._unbundled.popleft()
+
+    def _unbundle(self, bundle: bytes) -> None:
+        try:
+            frames = msgpack.unpackb(bundle[len(_BUNDLE_PREFIX) :])
+            wanted = [f for f in frames if f[: f.find(b"\0")] in self._topics]
+        except Exception:
+            raise DecodeError(
+                f"bundle: expected a list of frames, found {len(bundle)} bytes that are not"
+            ) from None
+        self._unbundled.extend(wanted)
+
+    def _receive(self, timeout: float) -> bytes | None:
         milliseconds = int(timeout * 1000)
         try:
             if milliseconds <= 0:
@@ -98,6 +144,8 @@ class ZmqPort:
             except zmq.Again:
                 return self._subscribers
             topic = note[1:].removesuffix(b"\0").decode(errors="replace")
+            if topic != BUNDLE and topic not in TOPICS:
+                continue
             if note[:1] == b"\x01":
                 self._subscribers[topic] += 1
             elif note[:1] == b"\x00":
@@ -133,6 +181,9 @@ class MemoryPort:
     def publish(self, frame: bytes) -> None:
         for inbox in self._inboxes.get(frame[: frame.find(b"\0")].decode(), ()):
             inbox.append(frame)
+
+    def flush(self) -> None:
+        """Nothing is ever held back in memory."""
 
     def receive(self, timeout: float) -> bytes | None:
         return self._inbox.popleft() if self._inbox else None

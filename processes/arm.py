@@ -6,7 +6,7 @@ import numpy as np
 
 from vibrissa.control.arm_path import ArmLimits, ArmPath, Motion, circuit
 from vibrissa.messages.codec import Message
-from vibrissa.messages.types import TICK_HZ, TICK_NS, ArmReading, ArmSetpoint, ArmState
+from vibrissa.messages.types import TICK_NS, ArmReading, ArmSetpoint, ArmState
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.node import Output
 from vibrissa.rig.maze import parse_maze
@@ -18,7 +18,7 @@ MARGIN = 0.045
 
 
 def make_path(experiment: Experiment) -> ArmPath:
-    """The timed circuit of an experiment; raised and at rest while whisking is calibrated.
+    """The timed circuit of an experiment: lowered from the height of calibration, then travelling.
 
     Raises MazeError or ArmPathError.
     """
@@ -26,7 +26,6 @@ def make_path(experiment: Experiment) -> ArmPath:
     motion = Motion(
         speed=experiment.arm.speed,
         lift=experiment.arm.lift,
-        t_start=experiment.calibration_ticks / TICK_HZ,
     )
     route = circuit(maze.width, maze.height, experiment.arm.sequence, pitch=maze.pitch)
     corner = (maze.width * maze.pitch + MARGIN, maze.height * maze.pitch + MARGIN, 0.4)
@@ -34,28 +33,37 @@ def make_path(experiment: Experiment) -> ArmPath:
 
 
 class ArmNode:
-    """Streams the set-point of the next arm cycle; moves only between start and stop."""
+    """Streams the set-point of the next arm cycle.
+
+    The head rests, raised, until the operator has started the run and the whiskers are calibrated;
+    a stop or a fault ends all motion for good.
+    """
 
     def __init__(self, experiment: Experiment) -> None:
         self._path = make_path(experiment)
-        self._moving = False
+        self._started = False
+        self._departure: int | None = None
         self._setpoint = np.array(self._path.pose(0), np.float64)
 
     def step(self, message: Message) -> list[Output]:
         match message.topic:
             case "rig.arm":
                 return self._cycle(message.body)
+            case "whisk.calibration" if self._started and self._departure is None:
+                self._departure = message.t + TICK_NS
             case "run.event" if message.body.kind == "start":
-                self._moving = True
+                self._started = True
             case "run.event" | "host.event" if message.body.kind in ("retract", "stop"):
-                self._moving = False
+                self._started = False
         return []
 
     def _cycle(self, reading: ArmReading) -> list[Output]:
         following = reading.tick + ARM_TICKS
-        if self._moving:
-            self._setpoint = np.array(self._path.pose(following * TICK_NS), np.float64)
+        moving = self._started and self._departure is not None
+        if self._started and self._departure is not None:
+            elapsed = following * TICK_NS - self._departure
+            self._setpoint = np.array(self._path.pose(elapsed), np.float64)
         return [
-            ("arm.state", ArmState(reading.tick, reading.pose, int(self._moving))),
+            ("arm.state", ArmState(reading.tick, reading.pose, int(moving))),
             ("arm.setpoint", ArmSetpoint(following, self._setpoint)),
         ]

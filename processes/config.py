@@ -124,11 +124,6 @@ class Experiment(Section):
         """Length of a whisk cycle in ticks."""
         return round(self.whisk.period * TICK_HZ)
 
-    @property
-    def calibration_ticks(self) -> int:
-        """How long the head is held free at the start."""
-        return self.whisk.calibration_cycles * self.period_ticks
-
     @model_validator(mode="after")
     def _fits(self) -> Experiment:
         from vibrissa.processes.table import PROCESSES

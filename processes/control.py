@@ -22,7 +22,7 @@ _FIELDS: dict[str, dict[str, type]] = {
     "fault": {"cause": str},
     "bye": {"sent": dict, "stats": dict, "cpu_s": float, "counters": dict},
     "go": {"t0_ns": int},
-    "finish": {"sent": dict},
+    "finish": {"sent": dict, "cause": str, "died": str},
     "closed": {"received": dict, "cpu_s": float},
     "leave": {},
 }

@@ -33,6 +33,7 @@ class FrameLog:
         self.received: dict[str, int] = {}
         self.sync = self._writer.sync
         self.close = self._writer.close
+        self.note = self._writer.add_metadata
 
     def write(self, frame: bytes) -> int:
         """Append a frame; returns its logical time. Raises DecodeError for what is no frame."""

@@ -35,6 +35,8 @@ from vibrissa.processes.table import PROCESSES, build
 
 HOUSEKEEPING_NS: Final = 50_000_000
 """How often receipts are handed in, so that a crash costs few."""
+BUNDLE_NS: Final = 10_000_000
+"""How often bundled listeners are served: what a crash of this process may take from the log."""
 RECEIPT_BATCH: Final = 400
 DRAIN_S: Final = 0.005
 PARTING_TICKS: Final = 600
@@ -61,7 +63,11 @@ class Host:
         self.control = ControlLine(self.context, layout.endpoints["control"], name)
         self.control.say("hello", pid=os.getpid(), missing=self.missing)
         self.port = ZmqPort(
-            self.context, layout.endpoints[name], layout.hears(name), layout.connections(name)
+            self.context,
+            layout.endpoints[name],
+            layout.hears(name),
+            layout.connections(name),
+            bundled=layout.bundled(name),
         )
         self.steppers = {n: Stepper(n, build(n, experiment)) for n in self.nodes}
         self.books = {n: ReceiptBook(n) for n in self.nodes}
@@ -77,6 +83,7 @@ class Host:
         self._drivers = {r.name: r.hears[0] for r in rows}
         self._probed: dict[int, int] = {}
         self._housekept = 0
+        self._flushed = 0
         self._reported = 0
         self._parent = os.getppid()
         self._leave_at = 0
@@ -199,7 +206,11 @@ class Host:
 
     def _housekeep(self) -> None:
         now = time.monotonic_ns()
+        if now - self._flushed < BUNDLE_NS:
+            return
+        self._flushed = now
         if now - self._housekept < HOUSEKEEPING_NS:
+            self.port.flush()
             return
         self._housekept = now
         self._flush(final=False)
@@ -220,6 +231,8 @@ class Host:
             self._reported = now
             for node in self.nodes:
                 self._publish_own(self._telemetry(node))
+        self.port.subscribers()
+        self.port.flush()
 
     def _telemetry(self, node: str) -> bytes:
         clock = self.clocks[node]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import collections
 import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from vibrissa.messages.topics import TOPICS
+from vibrissa.messages.transport import BUNDLE
 from vibrissa.processes.table import PROCESSES, PUBLISHED_BY_HOSTS
 
 SUPERVISOR_SAYS = ("run.event",)
@@ -61,6 +63,13 @@ class Layout:
             return set()
         return {p for p in everyone if topic in self.says(p)}
 
+    def bundled(self, process: str) -> bool:
+        """Whether a process takes what it hears in bundles: nothing in it reacts at once."""
+        nodes = self.hosts.get(process, [])
+        return process == "recorder" or (
+            bool(nodes) and all(PROCESSES[n].pacing == "drain" for n in nodes)
+        )
+
     def connections(self, process: str) -> list[str]:
         """Endpoints a process must connect to for what it hears."""
         if process == "recorder":
@@ -74,10 +83,9 @@ class Layout:
         """How many listeners each topic of a process must have before the run may start."""
         listeners = [p for p in ("supervisor", "recorder", *self.hosts) if p != process]
         endpoint = self.endpoints[process]
-        heard: dict[str, int] = {}
+        heard: collections.Counter[str] = collections.Counter()
         for other in listeners:
             if endpoint in self.connections(other):
-                for topic in self.hears(other):
-                    if topic in self.says(process):
-                        heard[topic] = heard.get(topic, 0) + 1
-        return heard
+                said = [t for t in self.hears(other) if t in self.says(process)]
+                heard.update([BUNDLE] if self.bundled(other) else said)
+        return dict(heard)

@@ -40,6 +40,7 @@ class Recorder:
             layout.endpoints["recorder"],
             layout.hears("recorder"),
             layout.connections("recorder"),
+            bundled=True,
         )
         meta = dict(layout.metadata)
         self.log = FrameLog(Path(layout.log), meta.pop("run_id"), meta)
@@ -50,6 +51,7 @@ class Recorder:
         """Record until told to finish, or until the supervisor is gone and the bus is silent."""
         self.control.say("hello", pid=os.getpid(), missing=[])
         self.control.say("ready")
+        self.port.subscribers()
         try:
             cause = self._record()
             self.log.close(cause)
@@ -63,6 +65,7 @@ class Recorder:
 
     def _record(self) -> str:
         beat = 0.0
+        cause = ""
         expected: dict[str, int] | None = None
         deadline = float("inf")
         while True:
@@ -75,14 +78,16 @@ class Recorder:
                 self.control.say("beat", t=self.t, steps=steps, done=False)
             order = self.control.hear(0)
             if order and order["kind"] == "finish":
-                expected = order["sent"]
-                deadline = now + FINISH_S
+                cause, expected, deadline = order["cause"], order["sent"], now + FINISH_S
+                if order["died"]:
+                    self.log.note("died", {"processes": order["died"]})
             if expected is not None and all(
                 self.log.received.get(topic, 0) >= n for topic, n in expected.items()
             ):
-                return "stop"
+                return cause
             if now > deadline:
-                return "stop with messages missing"
+                self.log.note("died", {"processes": "messages of a process were not delivered"})
+                return cause
             if os.getppid() != self._parent and not took:
                 return "supervisor gone"
             if not took:

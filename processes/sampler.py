@@ -12,7 +12,9 @@ from vibrissa.processes.whisk import slew_limit
 
 CONTROLLER = ControllerId("whisk")
 RECOVERY_TICKS = 200
-"""Ticks in a row a controller must answer on time to get the drives back after it was late."""
+"""Ticks a controller must answer on time to get the drives back after it was late ..."""
+LONGEST_GAP = 10
+"""... with no more than these between two of them."""
 
 
 class SamplerNode:
@@ -30,8 +32,10 @@ class SamplerNode:
         self._retracting = False
         self._ticks = 0
         self._answered = 0
+        self._obeyed = 0
         self._late = 0
         self._punctual = 0
+        self._last_punctual = 0
         self._fell_back_late = False
 
     def step(self, message: Message) -> list[Output]:
@@ -48,8 +52,14 @@ class SamplerNode:
         return []
 
     def counters(self) -> dict[str, int]:
-        """Ticks seen, ticks whose command answered the sample before, commands that came late."""
-        return {"ticks": self._ticks, "answered": self._answered, "late": self._late}
+        """Ticks; those answered before the next sample came; those whose command the drives were
+        obeying when the next sample was taken; commands that came late."""
+        return {
+            "ticks": self._ticks,
+            "answered": self._answered,
+            "obeyed": self._obeyed,
+            "late": self._late,
+        }
 
     def _reading(self, reading: HeadReading) -> list[Output]:
         tick = reading.tick
@@ -57,7 +67,7 @@ class SamplerNode:
         if tick >= self._retract_tick:
             outputs += self._start_retracting()
         self._ticks += 1
-        self._answered += reading.answers == tick - 1
+        self._obeyed += reading.answers == tick - 1
         sample = HeadSample(
             tick=tick,
             answers=reading.answers,
@@ -73,14 +83,19 @@ class SamplerNode:
         controller = ControllerId(source, epoch)
         outputs: list[Output] = []
         if self._fell_back_late and controller == CONTROLLER:
-            self._punctual = self._punctual + 1 if command.tick == self._arbiter.tick else 0
-            if self._punctual >= RECOVERY_TICKS:
-                outputs = self._route(CONTROLLER)
+            outputs = self._recover(command.tick)
         routing = self._arbiter.on_command(controller, command.tick, command.command)
         if routing.decision is not None and routing.decision.kind == "refused":
             self._late += controller == self._arbiter.active and command.tick < self._arbiter.tick
             return outputs  # counted; one event per late command would flood the log
         return outputs + self._routed(command.tick, routing)
+
+    def _recover(self, tick: int) -> list[Output]:
+        if tick != self._arbiter.tick:
+            return []
+        self._punctual = self._punctual + 1 if tick - self._last_punctual <= LONGEST_GAP else 1
+        self._last_punctual = tick
+        return self._route(CONTROLLER) if self._punctual >= RECOVERY_TICKS else []
 
     def _routed(self, tick: int, routing: Routing) -> list[Output]:
         outputs: list[Output] = []
@@ -90,6 +105,7 @@ class SamplerNode:
             self._punctual = 0
         if routing.command is not None:
             name = self._arbiter.active.name
+            self._answered += 1
             outputs.append(("head.command", HeadCommand(tick, name, routing.command)))
         return outputs
 

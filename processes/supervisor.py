@@ -42,6 +42,10 @@ LEAD_S: Final = 0.25
 WARM_S: Final = 300.0
 BYE_S: Final = 5.0
 CLOSE_S: Final = 12.0
+CATCH_UP_S: Final = 60.0
+"""How long a node may take to finish what it heard before the run is stopped."""
+CAUGHT_UP_TICKS: Final = 16
+"""One arm cycle: the arm, at 125 Hz, is never nearer to the end than this."""
 POLL_S: Final = 0.02
 FATAL: Final = ("fault",)
 """Kinds of node.event that end a run."""
@@ -236,21 +240,26 @@ class Supervisor:
             drivers = [c for c in self.children.values() if c.done]
             if self.cause is None and drivers:
                 self.cause = "completed"
-                time.sleep(0.05)
 
     def _end(self) -> None:
         """Retract, stop, close; what is dead or silent is not waited for."""
-        if self.cause != "completed":
+        hosts = [c for n, c in self.children.items() if n != "recorder"]
+        if self.cause == "completed":
+            end = (self.experiment.ticks - CAUGHT_UP_TICKS) * TICK_NS
+            self._until(
+                CATCH_UP_S, "catching up", lambda: all(c.t >= end or _dead(c) for c in hosts)
+            )
+        else:
             self._decide("retract", str(self.cause))
             self._until(RETRACT_S, "retracting", lambda: False)
         self._decide("stop", str(self.cause))
-        hosts = [c for n, c in self.children.items() if n != "recorder"]
         self._until(BYE_S, "stopping", lambda: all(c.bye or _dead(c) for c in hosts))
         recorder = self.children["recorder"]
         for child in hosts:
             if child.bye:
                 self.sent.update(child.bye["sent"])
-        self.desk.say("recorder", "finish", sent=dict(self.sent))
+        died = ", ".join(c.name for c in hosts if not c.bye)
+        self.desk.say("recorder", "finish", sent=dict(self.sent), cause=str(self.cause), died=died)
         self._until(CLOSE_S, "closing the log", lambda: bool(recorder.closed) or _dead(recorder))
         for child in hosts:
             self.desk.say(child.name, "leave")
@@ -314,6 +323,7 @@ class Supervisor:
         frame = CODECS["run.event"].encode("supervisor", 0, self._event_seq, tick * TICK_NS, event)
         self._event_seq += 1
         self.port.publish(frame)
+        self.port.flush()
         self.sent["run.event"] += 1
         self._note(tick, kind, "supervisor", cause)
 

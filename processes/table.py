@@ -69,7 +69,7 @@ PROCESSES: Final[dict[str, Process]] = {
         Process(
             "arm",
             "vibrissa.processes.arm:ArmNode",
-            hears=("rig.arm", "run.event", "host.event"),
+            hears=("rig.arm", "whisk.calibration", "run.event", "host.event"),
             says=("arm.state", "arm.setpoint", "node.event"),
             pacing="arrival",
             priority=40,

@@ -274,16 +274,18 @@ def _verify(
         raise UnusableLogError(f"{reader.path}: a message can't be replayed: {error}") from None
     elapsed = time.monotonic() - began
     first = first_cause([c.finding for c in checks.values() if c.finding is not None])
-    complete = reader.complete is not False and "recovered" not in reader.extra
+    cut = "recovered" in reader.extra or reader.complete is False
+    died = reader.extra.get("died", {}).get("processes", "")
     if first is None:
         lacking = [why for c in checks.values() if (why := c.leftovers())]
-        if lacking and complete:
+        if lacking and not (cut or died):
             raise UnusableLogError(f"{reader.path}: {lacking[0]}")
         if not any(c.steps for c in checks.values()):
             raise UnusableLogError(f"{reader.path}: it has no receipts, so nothing can be re-run")
-        if not complete:
+        if cut or (died and lacking):
+            why = f"{died} died during the run" if died else "the log is cut off"
             ends = ", ".join(f"{c.name} {c.steps}" for c in checks.values())
-            notes.append(f"the log is cut off; verified to its last complete steps: {ends}")
+            notes.append(f"{why}; verified to the last complete steps: {ends}")
     return Verdict(
         identical=first is None,
         executor=executor,

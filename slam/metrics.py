@@ -9,9 +9,8 @@ Poses are float64[n, 3]: x (m), y (m), heading (rad).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -237,7 +236,7 @@ def to_tum(times: ArrayLike, poses: ArrayLike, height: float = 0.0) -> str:
     )
 
 
-def _poses(poses: ArrayLike | Sequence[Any], name: str) -> Floats:
+def _poses(poses: ArrayLike, name: str) -> Floats:
     array = np.ascontiguousarray(poses, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0:
         raise MetricError(f"{name}: expected shape (n, 3) with n > 0, found {array.shape}")

@@ -210,6 +210,37 @@ def test_wall_met_sideways_deflects_sideways_and_lets_go() -> None:
     assert (pushed > 0).all() and (np.diff(pushed) > 0).all()
     assert pushed[0] < 0.1 * pushed[-1]
     assert np.abs(np.diff(y[touch - 50 : touch + 400])).max() < 1e-6
+    # Retracting lifts the tip over the wall.
+    assert plant.state[h.SIDE, MID_LEFT] == 1
+    for t in range(4000, 6000):
+        _, x, _ = plant.step(t, (0.15, 0.0, NOSE_HEIGHT, 0.0), np.zeros(18, dtype=np.float32))
+    assert plant.state[h.SIDE, MID_LEFT] == 0 and abs(x[MID_LEFT]) < 1e-8
+
+
+def test_floor_stops_a_whisker_that_comes_too_low() -> None:
+    plant = HeadPlant(NOTHING, 1, QUIET)
+    for t in range(WHISK // 2):
+        _, x, y = plant.step(t, (0.0, 0.0, 0.060, 0.0), whisking(plant, t))
+    assert (y[:6] < 1e-5).all()
+    assert (y[6:] > 1e-4).all() and not x.any()
+    assert (
+        plant.state[h.PSI, 6:] > plant.params.geometry.phi_start[6:] - plant.state[h.THETA, 6:]
+    ).all()
+
+
+def test_contact_does_not_chatter_along_a_maze() -> None:
+    plant = HeadPlant(wall_boxes(load_maze("board7x5")), 5, QUIET)
+    whisks, jumps, contact = 20, 0, 0
+    before = plant.state[h.MOMENT_Y].copy()
+    for t in range(whisks * WHISK):
+        plant.step(t, (0.09 + 0.05 * t * h.TICK, 0.09, NOSE_HEIGHT, 0.0), whisking(plant, t))
+        now = plant.state[h.MOMENT_Y]
+        jumps += int((np.abs(now - before) > 1e-4).sum())
+        contact += int((plant.state[h.PEG] >= 0).sum())
+        before = now.copy()
+    # Slips and landings, a few per whisk of eighteen whiskers; chatter would be hundreds.
+    assert 0 < jumps < 2 * whisks
+    assert contact > 0.1 * whisks * WHISK * WHISKERS
 
 
 def test_watchdog_retracts_after_twenty_milliseconds_without_command() -> None:

@@ -308,14 +308,15 @@ def test_a_view_on_the_seam_of_the_torus_injects_unless_faithful():
         assert bool(network.cells[0, 5, 5] > 0.0) is injects
 
 
-def test_the_injected_cell_does_not_hang_on_the_last_bit():
-    network = PoseCells(IRAT)
-    network._best[:] = (np.nextafter(5.0, 0.0), 5.0, 18.0)
-    for view in range(12):
-        network.on_view_template(view)
-    network._cells[:] = 0.0
-    network.on_view_template(0)
-    assert network.cells[18, 5, 5] > 0.0
+def test_a_view_on_a_cell_injects_there_whatever_the_last_bit_unless_faithful():
+    for config, column in ((IRAT, 5), (faithful(IRAT), 4)):
+        network = PoseCells(config)
+        network._best[:] = (np.nextafter(5.0, 0.0), 5.0, 18.0)
+        for view in range(12):
+            network.on_view_template(view)
+        network._cells[:] = 0.0
+        network.on_view_template(0)
+        assert np.argwhere(network.cells).tolist() == [[18, 5, column]]
 
 
 def test_a_kidnapped_packet_comes_back_after_enough_different_views():
