@@ -20,12 +20,16 @@ import numpy as np
 
 from vibrissa.messages import fastpath
 from vibrissa.messages.errors import DecodeError, EncodeError
-from vibrissa.messages.fields import Array, Field
+from vibrissa.messages.fields import Array, Field, Int
 from vibrissa.messages.topics import TOPICS, Topic
 
 MAX_FRAME_BYTES: Final = 16 << 20
 _HEADER: Final = 5  # version, source, epoch, seq, t
-_I64: Final = 2**63
+_NUMBERS: Final = {
+    "epoch": Int(0, 2**63 - 1),
+    "seq": Int(0, 2**32 - 1),
+    "t": Int(-(2**63), 2**63 - 1),
+}
 
 
 class Message(NamedTuple):
@@ -89,6 +93,9 @@ class Codec:
             raise EncodeError(
                 f"{self.topic}: expected {self.type.__name__}, found {type(body).__name__}"
             )
+        fault = _identity_fault(source, epoch, seq, t)
+        if fault:
+            raise EncodeError(f"{self.topic}: {fault}")
         values: list[Any] = [self.version, source, epoch, seq, t]
         for name in self._others:
             field = self.fields[name]
@@ -199,26 +206,33 @@ class Codec:
         if type(values) is not list or len(values) < _HEADER:
             raise DecodeError(f"{self.topic}: expected an array of {self._length} values")
         version = values[0]
-        if version != self.version:
+        if type(version) is not int or version != self.version:
             raise DecodeError(
                 f"{self.topic}: expected version {self.version}, found {_short(version)}"
             )
         if len(values) != self._length:
             raise DecodeError(f"{self.topic}: expected {self._length} values, found {len(values)}")
         _, source, epoch, seq, t = values[:_HEADER]
-        if type(source) is not str or not 0 < len(source) <= 40:
-            raise DecodeError(f"{self.topic}: expected a source name, found {_short(source)}")
-        for name, value, low in (("epoch", epoch, 0), ("seq", seq, 0), ("t", t, -_I64)):
-            if type(value) is not int or not low <= value < _I64:
-                raise DecodeError(
-                    f"{self.topic} from {source}: expected {name} to be a whole number, "
-                    f"found {_short(value)}"
-                )
+        fault = _identity_fault(source, epoch, seq, t)
+        if fault:
+            raise DecodeError(f"{self.topic}: {fault}")
         return values
 
 
 def _shared(field: Array) -> bool:
     return field.dtype == "<f4" and field.fixed and len(field.shape) == 1
+
+
+def _identity_fault(source: Any, epoch: Any, seq: Any, t: Any) -> str | None:
+    """What is wrong with an identity; sources are words, because receipts list them in a line."""
+    named = type(source) is str and 0 < len(source) <= 40
+    if not named or not source.isprintable() or " " in source:
+        return f"expected a source name, found {_short(source)}"
+    for (name, field), value in zip(_NUMBERS.items(), (epoch, seq, t), strict=True):
+        fault = field.fault(value)
+        if fault:
+            return f"{name} of {source}: {fault}"
+    return None
 
 
 def _short(value: Any) -> str:
@@ -227,14 +241,14 @@ def _short(value: Any) -> str:
 
 
 CODECS: Final[dict[str, Codec]] = {name: Codec(topic) for name, topic in TOPICS.items()}
-_BY_PREFIX: Final[dict[bytes, Codec]] = {c.prefix[:-1]: c for c in CODECS.values()}
+_BY_PREFIX: Final[dict[bytes, Codec]] = {c.prefix: c for c in CODECS.values()}
 
 
 def topic_of(frame: bytes) -> str:
     """The topic a frame belongs to. Raises DecodeError when it names none of the table."""
     if len(frame) > MAX_FRAME_BYTES:
         raise DecodeError(f"frame: expected at most {MAX_FRAME_BYTES} bytes, found {len(frame)}")
-    codec = _BY_PREFIX.get(frame[: frame.find(b"\0")])
+    codec = _BY_PREFIX.get(frame[: frame.find(b"\0") + 1])
     if codec is None:
         raise DecodeError(f"frame: expected a topic of the table, found {frame[:24]!r}")
     return codec.topic

@@ -20,8 +20,9 @@ from vibrissa.messages.fields import Array, Field, Int, Real, Text
 from vibrissa.numerics import compiled
 
 HEADER_CHECK = (
-    "type(source) is str and 0 < len(source) <= 40 and type(epoch) is int and epoch >= 0"
-    " and type(seq) is int and seq >= 0 and type(t) is int"
+    "type(source) is str and 0 < len(source) <= 40 and source.isprintable() and ' ' not in source"
+    f" and type(epoch) is int and 0 <= epoch < {2**63} and type(seq) is int"
+    f" and 0 <= seq < {2**32} and type(t) is int and {-(2**63)} <= t < {2**63}"
 )
 
 
@@ -46,7 +47,7 @@ def decoder(
 ) -> Callable[[bytes], Any]:
     """decode(frame) -> message, for a type whose fields travel in `order` (single, block)."""
     single, block = order
-    checks = [HEADER_CHECK, f"version == {version}"]
+    checks = [HEADER_CHECK, f"type(version) is int and version == {version}"]
     checks += [_check(fields[name], f"f_{name}") for name in single]
     limits = _limits(fields, block)
     if block:
@@ -79,9 +80,9 @@ def encoder(
     limits = _limits(fields, block)
     lines = ["def encode(source, epoch, seq, t, value):", " if type(value) is body:"]
     lines += [f"  f_{name} = value.{name}" for name in fields]
-    checks = [_check(fields[name], f"f_{name}") for name in single]
+    checks = [HEADER_CHECK, *(_check(fields[name], f"f_{name}") for name in single)]
     checks += [f"f_{n}.shape == {_array(fields[n]).shape} and f_{n}.dtype == F4" for n in block]
-    lines += ["  try:", f"   fine = {' and '.join(checks) or 'True'}"]
+    lines += ["  try:", f"   fine = {' and '.join(checks)}"]
     lines += ["  except AttributeError:", "   fine = False", "  if fine:"]
     values = ["version", "source", "epoch", "seq", "t", *_local(single)]
     if block:
@@ -101,7 +102,7 @@ def _check(field: Field, name: str) -> str:
     if isinstance(field, Real):
         return f"type({name}) is float and -{field.limit!r} <= {name} <= {field.limit!r}"
     if isinstance(field, Text):
-        return f"type({name}) is str and len({name}) <= {field.longest}"
+        return f"type({name}) is str and len({name}) <= {field.longest} and {name}.isascii()"
     return "False"
 
 

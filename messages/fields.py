@@ -66,7 +66,7 @@ class Real:
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """A string of at most `longest` characters."""
+    """A string of at most `longest` characters that has a UTF-8 form."""
 
     longest: int = 400
 
@@ -75,6 +75,10 @@ class Text:
             return f"expected text, found {_kind(value)}"
         if len(value) > self.longest:
             return f"expected at most {self.longest} characters, found {len(value)}"
+        try:
+            value.encode()
+        except UnicodeEncodeError:
+            return "expected text that UTF-8 can express, found lone surrogates"
         return None
 
     def json_schema(self) -> dict[str, Any]:

@@ -66,6 +66,8 @@ class ZmqPort:
         Raises TransportError when an endpoint is in use, malformed or not on this machine.
         """
         self._subscribers: collections.Counter[str] = collections.Counter()
+        self._heard: set[bytes] = set()
+        self._bundling = False
         self._waited_ms = -1
         self._topics = {topic.encode() for topic in topics}
         self._bundled = bundled
@@ -95,9 +97,9 @@ class ZmqPort:
             raise
 
     def publish(self, frame: bytes) -> None:
-        if self._subscribers.get(frame[: frame.find(b"\0")].decode()):
+        if frame[: frame.find(b"\0")] in self._heard:
             self._out.send(frame, zmq.NOBLOCK)
-        if self._subscribers.get(BUNDLE):
+        if self._bundling:
             self._bundle.append(frame)
 
     def flush(self) -> None:
@@ -142,6 +144,8 @@ class ZmqPort:
             try:
                 note = self._out.recv(zmq.NOBLOCK)
             except zmq.Again:
+                self._heard = {t.encode() for t, n in self._subscribers.items() if n > 0}
+                self._bundling = self._subscribers[BUNDLE] > 0
                 return self._subscribers
             topic = note[1:].removesuffix(b"\0").decode(errors="replace")
             if topic != BUNDLE and topic not in TOPICS:

@@ -1,11 +1,11 @@
-"""Several nodes in one process, joined by the in-memory transport under the node contract."""
+"""Several nodes under one roof, joined in memory under the node contract."""
 
 from __future__ import annotations
 
+import collections
 from collections.abc import Callable, Iterable
 from typing import Protocol
 
-from vibrissa.messages.transport import Hub, MemoryPort
 from vibrissa.processes.node import Step
 
 
@@ -23,31 +23,25 @@ OnStep = Callable[[Steps, bytes, Step], None]
 class Group:
     """Nodes that hear each other directly.
 
-    A frame that is fed in reaches every member that hears its topic; what they say is delivered in
-    turn until nobody has anything left to do. Members are served in their given order, one message
-    at a time, so the same feeds always give the same order of steps.
+    A frame that is fed in reaches every member that hears its topic, in the members' order; what
+    they say in turn queues up behind it, until nobody has anything left to do. The same feeds
+    always give the same order of steps.
     """
 
     def __init__(self, members: Iterable[tuple[Steps, Iterable[str]]], on_step: OnStep) -> None:
-        self._hub = Hub()
-        self._publish = self._hub.port().publish
-        self._members: list[tuple[Steps, MemoryPort]] = [
-            (steps, self._hub.port(hears)) for steps, hears in members
-        ]
+        self._hearers: dict[bytes, list[Steps]] = {}
+        for steps, hears in members:
+            for topic in hears:
+                self._hearers.setdefault(topic.encode(), []).append(steps)
         self._on_step = on_step
 
     def feed(self, frame: bytes) -> None:
         """Deliver a frame and everything that follows from it."""
-        self._publish(frame)
-        busy = True
-        while busy:
-            busy = False
-            for steps, port in self._members:
-                heard = port.receive(0)
-                if heard is None:
-                    continue
-                busy = True
+        queue = collections.deque((frame,))
+        hearers = self._hearers
+        while queue:
+            heard = queue.popleft()
+            for steps in hearers.get(heard[: heard.find(b"\0")], ()):
                 step = steps.step(heard)
-                for output in step.outputs:
-                    self._publish(output)
+                queue.extend(step.outputs)
                 self._on_step(steps, heard, step)

@@ -31,7 +31,7 @@ from vibrissa.processes.node import Step, Stepper, counters, timer_frame
 from vibrissa.processes.receipts import ReceiptBook
 from vibrissa.processes.rehearsal import rehearse
 from vibrissa.processes.stats import Clocking
-from vibrissa.processes.table import PROCESSES, build
+from vibrissa.processes.table import PROCESSES, Process, build
 
 HOUSEKEEPING_NS: Final = 50_000_000
 """How often receipts are handed in, so that a crash costs few."""
@@ -41,6 +41,30 @@ RECEIPT_BATCH: Final = 400
 DRAIN_S: Final = 0.005
 PARTING_TICKS: Final = 600
 """Ticks a host goes on stepping after its supervisor is gone, so that what moves can stop."""
+
+
+class Seat:
+    """What a host keeps of one of its nodes: receipts, clocking, and the reaction probe."""
+
+    def __init__(self, row: Process) -> None:
+        self.driver = row.hears[0]
+        self.answer = row.answer
+        self.book = ReceiptBook(row.name)
+        self.clock = Clocking()
+        self._out: dict[int, int] = {}
+
+    def probe_went_out(self, t: int, now: int) -> None:
+        """Something that awaits an answer was published for time t."""
+        if self.answer:
+            if len(self._out) > 4000:
+                self._out.clear()
+            self._out[t] = now
+
+    def probe_came_back(self, t: int, now: int) -> None:
+        """The answer to what was published for time t has come."""
+        went = self._out.pop(t, None)
+        if went is not None:
+            self.clock.latency.add((now - went) * 1e-3)
 
 
 class Host:
@@ -70,8 +94,7 @@ class Host:
             bundled=layout.bundled(name),
         )
         self.steppers = {n: Stepper(n, build(n, experiment)) for n in self.nodes}
-        self.books = {n: ReceiptBook(n) for n in self.nodes}
-        self.clocks = {n: Clocking() for n in self.nodes}
+        self.seats = {row.name: Seat(row) for row in rows}
         self.group = Group([(self.steppers[r.name], r.hears) for r in rows], self._stepped)
         self.sent: collections.Counter[str] = collections.Counter()
         self.t0 = 0
@@ -79,9 +102,6 @@ class Host:
         self.stopping = False
         self._done = False
         self._own_seq: collections.Counter[tuple[str, str]] = collections.Counter()
-        self._probes = {r.name: r.probe for r in rows if r.probe}
-        self._drivers = {r.name: r.hears[0] for r in rows}
-        self._probed: dict[int, int] = {}
         self._housekept = 0
         self._flushed = 0
         self._reported = 0
@@ -107,10 +127,12 @@ class Host:
             traceback.print_exc()
             self.control.say("fault", cause=f"{type(error).__name__}: {error}"[:400])
         self._flush(final=True)
+        for stepper in self.steppers.values():
+            self.sent.update(stepper.sent)
         self.control.say(
             "bye",
             sent=dict(self.sent),
-            stats={n: c.summary() for n, c in self.clocks.items()},
+            stats={n: seat.clock.summary() for n, seat in self.seats.items()},
             cpu_s=time.process_time() - cpu,
             counters={n: counters(s) for n, s in self.steppers.items()},
         )
@@ -171,34 +193,25 @@ class Host:
 
     def _stepped(self, steps: Steps, frame: bytes, step: Step) -> None:
         """Publish what a step said, then measure it and write its receipt."""
+        publish = self.port.publish
         for output in step.outputs:
-            self.port.publish(output)
-        now = time.monotonic_ns()
-        start, self._mark = self._mark, now
-        node = steps.name
+            publish(output)
+        end = time.monotonic_ns()
+        start, self._mark = self._mark, end
+        seat = self.seats[steps.name]
         topic = step.stream[0]
-        clock = self.clocks[node]
-        if topic == self._drivers[node]:
+        if topic == seat.driver:
             self.t = step.t
-            clock.tick(self.t0 + step.t, start, now)
-        probe = self._probes.get(node)
-        if probe is not None:
-            if topic == probe[1]:
-                went = self._probed.pop(step.t, None)
-                if went is not None:
-                    clock.latency.add((start - went) * 1e-3)
-            elif step.outputs and topic == self._drivers[node]:
-                if len(self._probed) > 4000:
-                    self._probed.clear()
-                self._probed[step.t] = now
-        for output in step.outputs:
-            self.sent[output[: output.find(b"\0")].decode()] += 1
-        book = self.books[node]
-        book.add(step)
-        if len(book) >= RECEIPT_BATCH:
-            self._publish_own(book.frame(step.t))
-        if topic == "run.event" and CODECS[topic].decode(frame).body.kind == "stop":
+            seat.clock.tick(self.t0 + step.t, start, end)
+            if step.outputs:
+                seat.probe_went_out(step.t, end)
+        elif topic == seat.answer:
+            seat.probe_came_back(step.t, start)
+        elif topic == "run.event" and CODECS[topic].decode(frame).body.kind == "stop":
             self.stopping = True
+        seat.book.add(step)
+        if len(seat.book) >= RECEIPT_BATCH:
+            self._publish_own(seat.book.frame(step.t))
 
     def _publish_own(self, frame: bytes) -> None:
         self.port.publish(frame)
@@ -223,9 +236,9 @@ class Host:
             self._inject("stop", "supervisor gone")
 
     def _flush(self, *, final: bool) -> None:
-        for book in self.books.values():
-            if len(book):
-                self._publish_own(book.frame(self.t))
+        for seat in self.seats.values():
+            if len(seat.book):
+                self._publish_own(seat.book.frame(self.t))
         now = time.monotonic_ns()
         if final or now - self._reported > 1_000_000_000:
             self._reported = now
@@ -235,7 +248,7 @@ class Host:
         self.port.flush()
 
     def _telemetry(self, node: str) -> bytes:
-        clock = self.clocks[node]
+        clock = self.seats[node].clock
         body = Telemetry(
             steps=self.steppers[node].steps,
             lateness_us=np.array(clock.lateness.recent(), np.float32),

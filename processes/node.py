@@ -47,7 +47,8 @@ class Stepper:
         self.epoch = epoch
         self.steps = 0
         self.digest = 0
-        self._seq: dict[str, int] = {}
+        self.sent: dict[str, int] = {}
+        """topic -> messages said so far"""
 
     def step(self, frame: bytes) -> Step:
         """Feed one frame. Raises DecodeError or EncodeError before the digest moves."""
@@ -61,8 +62,8 @@ class Stepper:
         return Step(message[:3], message.seq, message.t, outputs, digest)
 
     def _frame(self, topic: str, t: int, body: Any) -> bytes:
-        seq = self._seq.get(topic, 0)
-        self._seq[topic] = seq + 1
+        seq = self.sent.get(topic, 0)
+        self.sent[topic] = seq + 1
         return CODECS[topic].encode(self.name, self.epoch, seq, t, body)
 
 

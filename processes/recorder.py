@@ -51,6 +51,7 @@ class Recorder:
         """Record until told to finish, or until the supervisor is gone and the bus is silent."""
         self.control.say("hello", pid=os.getpid(), missing=[])
         self.control.say("ready")
+        self._cpu0 = time.process_time()
         self.port.subscribers()
         try:
             cause = self._record()
@@ -58,7 +59,9 @@ class Recorder:
         except (LogError, MessageError) as error:
             self.control.say("fault", cause=str(error)[:400])
             self._keep_draining()
-        self.control.say("closed", received=self.log.received, cpu_s=time.process_time())
+        self.control.say(
+            "closed", received=self.log.received, cpu_s=time.process_time() - self._cpu0
+        )
         self.control.close()
         self.port.close()
         self.context.term()

@@ -22,8 +22,8 @@ class Process:
 
     priority is SCHED_FIFO's, 0 for the ordinary scheduler. `source` marks a stand-in for hardware:
     what-if re-runs take its messages from the log instead of stepping it. `silence` is how many
-    seconds without a sign of life end the run. `probe` names a topic pair whose time between going
-    out and coming back is measured as reaction latency.
+    seconds without a sign of life end the run. The first topic it hears drives it; from the end of
+    that step to the arrival of the topic `answer` with the same t is its reaction latency.
     """
 
     name: str
@@ -34,7 +34,7 @@ class Process:
     priority: int
     silence: float = 2.0
     source: bool = False
-    probe: tuple[str, str] | None = None
+    answer: str = ""
 
 
 PROCESSES: Final[dict[str, Process]] = {
@@ -56,7 +56,7 @@ PROCESSES: Final[dict[str, Process]] = {
             says=("head.sample", "head.command", "node.event"),
             pacing="arrival",
             priority=48,
-            probe=("head.sample", "whisk.command"),
+            answer="whisk.command",
         ),
         Process(
             "whisk",

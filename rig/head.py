@@ -69,7 +69,7 @@ HEAD_ROWS = SHAFT_ROWS + 20
     PEG,  # wall touched in the whisking plane: box, or number of boxes for the floor; -1 none
     SIDE,  # 1 pushed to the left (counterclockwise seen from above) by a wall met sideways, -1, 0
     SIDE_BOX,  # the box that pushes sideways, -1 none
-    SIDE_DEPTH,  # m
+    SIDE_LEAN,  # horizontal lean sideways, offset over distance from the pivot, >= 0
     BEND,  # rad^2, angle^2 of the contact, smoothed over two ticks
     MOMENT_X,  # N m, quasi-static
     MOMENT_Y,
@@ -85,6 +85,7 @@ STATE_ROWS = 18
 TICK = 0.0005  # s
 DRIFT_TICKS = 200
 LEAST_DROP = 0.001  # m, a pivot is taken to be at least this far above a wall's top
+MOST_LEAN = 2.0  # a whisker bent further sideways than this comes free in any case
 QUIET = 1e-14  # N m, where a vibration has died away
 DRIFT_STREAM = 32  # first noise stream of the drift; those below are the whiskers' samples
 
@@ -128,7 +129,7 @@ def touch(
     chord = length / (1.0 + head[TIP_SLIP, i] * state[BEND, i])  # of the whisker as it is bent
     psi, gamma, bend = state[PSI, i], state[GAMMA, i], state[BEND, i]
     peg, side_box, side = int(state[PEG, i]), int(state[SIDE_BOX, i]), state[SIDE, i]
-    depth = state[SIDE_DEPTH, i]
+    lean = state[SIDE_LEAN, i]
     old_peg, old_side_box = peg, side_box
     floor = boxes.shape[0]
 
@@ -145,9 +146,8 @@ def touch(
             if cell >= 0:
                 first, last = starts[cell], starts[cell + 1]
 
-    if not clear_of(length, lowest, pz):
-        if chord > pz:
-            low, low_box = atan2(math.sqrt(chord * chord - pz * pz), pz), floor
+    if chord > pz and not clear_of(length, lowest, pz):
+        low, low_box = atan2(math.sqrt(chord * chord - pz * pz), pz), floor
 
     for n in range(first, last):
         b = items[n] if skip else n
@@ -174,12 +174,17 @@ def touch(
             out = min(outer - psi, psi - inner)
             s, c = sin(psi), cos(psi)
             if s > 0.0:
-                left, _, right, _ = side_extent(box, px, py, ux, uy, drop * s / c, chord * s)
-                if left > 0.0:
+                left, left_u, right, right_u = side_extent(
+                    box, px, py, ux, uy, drop * s / c, chord * s
+                )
+                if left > 0.0 > right:
                     toward = side
                     if toward == 0.0:
-                        toward = 1.0 if left <= -right else -1.0
-                    cost = max((left if toward > 0.0 else -right) - depth, 0.0)
+                        toward = 1.0 if left * left_u <= -right * right_u else -1.0
+                    if toward > 0.0:
+                        cost = max(left - lean, 0.0) * left_u
+                    else:
+                        cost = max(-right - lean, 0.0) * right_u
                     if cost < out * length:
                         if side == 0.0 and (cost < grab_cost or (cost == grab_cost and b < grab)):
                             grab, grab_cost, grab_side = b, cost, toward
@@ -207,13 +212,13 @@ def touch(
         box = boxes[side_box]
         drop = max(pz - box[TOP], LEAST_DROP)
         s, c = sin(psi), cos(psi)
-        depth, u = 0.0, 0.0
+        lean, u = 0.0, 0.0
         if s > 0.0:
             left, left_u, right, right_u = side_extent(box, px, py, ux, uy, drop * s / c, chord * s)
-            depth, u = (left, left_u) if side > 0.0 else (-right, right_u)
-        if 0.0 < depth < length:
+            lean, u = (left, left_u) if side > 0.0 else (-right, right_u)
+        if 0.0 < lean < MOST_LEAN:
             arm = min(max(u / s, LEAST_ARM * length), length)
-            turn = side * depth / arm
+            turn = side * lean * s
             turn_square = turn * turn
             moment_x = bending_stiffness(head[RIGIDITY, i], taper, arm) * turn
         else:
@@ -229,7 +234,7 @@ def touch(
                         low_box = peg
                     else:
                         psi, high_x = inner, near_x
-            side, side_box, depth = 0.0, -1, 0.0
+            side, side_box, lean = 0.0, -1, 0.0
 
     gamma = psi - phi
     moment_y = 0.0
@@ -267,7 +272,7 @@ def touch(
         bend = 0.0
     state[PSI, i], state[GAMMA, i], state[BEND, i] = psi, gamma, bend
     state[PEG, i], state[SIDE, i], state[SIDE_BOX, i] = peg, side, side_box
-    state[SIDE_DEPTH, i] = depth
+    state[SIDE_LEAN, i] = lean
     state[MOMENT_X, i], state[MOMENT_Y, i] = moment_x, moment_y
 
 

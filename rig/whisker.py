@@ -118,12 +118,14 @@ def side_extent(
     start: float,
     stop: float,
 ) -> tuple[float, float, float, float]:
-    """How far a box reaches to either side of the strip start <= u <= stop of the whisking plane.
+    """How far the shaft must lean to pass a box within start <= u <= stop on either side.
 
-    Returns (left, u there, right, u there), m: left >= 0 towards (-uy, ux), right <= 0; all zero
-    where the box is beside the strip.
+    Returns (left, u there, right, u there): the largest and smallest v / u of the box, v the offset
+    towards (-uy, ux) and u in m; all zero where the box is beyond start and stop, or start >= stop.
     """
     left, left_u, right, right_u = -1e9, 0.0, 1e9, 0.0
+    if start >= stop:
+        return 0.0, 0.0, 0.0, 0.0
     for k in range(4):
         x0 = (box[X_MIN] if k in (0, 3) else box[X_MAX]) - px
         y0 = (box[Y_MIN] if k in (0, 1) else box[Y_MAX]) - py
@@ -142,15 +144,16 @@ def side_extent(
         if u1 > stop:
             v1 += slope * (stop - u1)
             u1 = stop
-        if v0 > left:
-            left, left_u = v0, u0
-        if v1 > left:
-            left, left_u = v1, u1
-        if v0 < right:
-            right, right_u = v0, u0
-        if v1 < right:
-            right, right_u = v1, u1
-    if left <= 0.0 or right >= 0.0:
+        lean_0, lean_1 = v0 / max(u0, 1e-6), v1 / max(u1, 1e-6)
+        if lean_0 > left:
+            left, left_u = lean_0, u0
+        if lean_1 > left:
+            left, left_u = lean_1, u1
+        if lean_0 < right:
+            right, right_u = lean_0, u0
+        if lean_1 < right:
+            right, right_u = lean_1, u1
+    if left < right:
         return 0.0, 0.0, 0.0, 0.0
     return left, left_u, right, right_u
 

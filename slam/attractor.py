@@ -252,6 +252,8 @@ def integrate(
             up_j, up_i, right_j, right_i = -1, 0, 0, -1
         else:
             up_j, up_i, right_j, right_i = 0, -1, 1, 0
+        corner_j = n - 1 if up_j > right_j else 0
+        corner_i = n - 1 if up_i > right_i else 0
         first = (k + sign * low) % layers
         second = (k + sign * high) % layers
         for j in range(n):
@@ -260,21 +262,13 @@ def integrate(
                 if value == 0.0:
                     continue
                 value *= scale
-                lost_up = 1.0
-                lost_right = 1.0
+                kept_up, kept_right = 1.0, 1.0
                 if faithful:
-                    if quarter == 0:
-                        r, c = j, i
-                    elif quarter == 1:
-                        r, c = i, n - 1 - j
-                    elif quarter == 2:
-                        r, c = n - 1 - j, n - 1 - i
-                    else:
-                        r, c = n - 1 - i, j
-                    if r == n - 1 and c == 0:
-                        lost_up = 0.0
-                    if c == n - 1 and r == 0:
-                        lost_right = 0.0
+                    # what leaves one corner upwards and the opposite one to the right is lost
+                    if j == corner_j and i == corner_i:
+                        kept_up = 0.0
+                    if j == n - 1 - corner_j and i == n - 1 - corner_i:
+                        kept_right = 0.0
                 j_up = _wrapped(j + up_j, n)
                 i_up = _wrapped(i + up_i, n)
                 j_right = _wrapped(j + right_j, n)
@@ -288,8 +282,8 @@ def integrate(
                     layer = first if part == 0 else second
                     alive[layer] = 1
                     cells[layer, j, i] += weight * stay
-                    cells[layer, j_up, i_up] += weight * to_up * lost_up
-                    cells[layer, j_right, i_right] += weight * to_right * lost_right
+                    cells[layer, j_up, i_up] += weight * to_up * kept_up
+                    cells[layer, j_right, i_right] += weight * to_right * kept_right
                     cells[layer, j_both, i_both] += weight * both
 
 

@@ -12,7 +12,7 @@ from vibrissa.messages.codec import CODECS, Message
 from vibrissa.messages.fields import Array, Field, Int, Real, Text
 
 ROWS = 6
-HEADER_INTEGERS = st.integers(0, 2**63 - 1)
+LONG = st.integers(0, 2**63 - 1)
 SOURCES = st.text("abcdefghijklmnopqrstuvwxyz_-0123456789", min_size=1, max_size=40)
 
 
@@ -45,7 +45,8 @@ def messages(draw: st.DrawFn, topic: str) -> Message:
     """An identified message of a topic."""
     codec = CODECS[topic]
     body = codec.type(**{name: draw(values(field)) for name, field in codec.fields.items()})
-    epoch, seq, t = (draw(HEADER_INTEGERS) for _ in range(3))
+    epoch, t = draw(LONG), draw(LONG)
+    seq = draw(st.integers(0, 2**32 - 1))
     return Message(topic, draw(SOURCES), epoch, seq, t, body)
 
 

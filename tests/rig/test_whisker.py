@@ -133,6 +133,7 @@ def test_slice_is_the_part_of_the_ray_inside_the_box(heading: float, px: float, 
 def test_side_extent_of_a_wall_along_the_plane() -> None:
     box = np.array([0.05, 0.5, -0.002, 0.010, 0.05])
     left, _, right, _ = side_extent(box, 0.0, 0.0, 1.0, 0.0, 0.03, 0.12)
-    assert (left, right) == pytest.approx((0.010, -0.002))
+    assert (left, right) == pytest.approx((0.010 / 0.05, -0.002 / 0.05))
     assert side_extent(box, 0.0, 0.0, 1.0, 0.0, 0.01, 0.04) == (0.0, 0.0, 0.0, 0.0)
-    assert side_extent(box, 0.0, -0.1, 1.0, 0.0, 0.03, 0.12) == (0.0, 0.0, 0.0, 0.0)
+    left, _, right, _ = side_extent(box, 0.0, -0.1, 1.0, 0.0, 0.03, 0.12)
+    assert (left, right) == pytest.approx((0.110 / 0.05, 0.098 / 0.12))
