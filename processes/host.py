@@ -81,7 +81,8 @@ class Host:
         for row in rows:
             rehearse(row.name, experiment)
         self.missing = realtime.prepare(
-            max(r.priority for r in rows) if experiment.run.realtime else 0
+            max(r.priority for r in rows) if experiment.run.realtime else 0,
+            reflex=any(r.reflex for r in rows),
         )
         self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self.control = ControlLine(self.context, layout.endpoints["control"], name)

@@ -20,7 +20,8 @@ Pacing = Literal["timer", "arrival", "drain"]
 class Process:
     """One row: a node, what it hears, what it says, and how it is hosted.
 
-    priority is SCHED_FIFO's, 0 for the ordinary scheduler. `source` marks a stand-in for hardware:
+    priority is SCHED_FIFO's, 0 for the ordinary scheduler; `reflex` processes have a core of their
+    own. `source` marks a stand-in for hardware:
     what-if re-runs take its messages from the log instead of stepping it. `silence` is how many
     seconds without a sign of life end the run. The first topic it hears drives it; from the end of
     that step to the arrival of the topic `answer` with the same t is its reaction latency.
@@ -32,6 +33,7 @@ class Process:
     says: tuple[str, ...]
     pacing: Pacing
     priority: int
+    reflex: bool = False
     silence: float = 2.0
     source: bool = False
     answer: str = ""
@@ -56,6 +58,7 @@ PROCESSES: Final[dict[str, Process]] = {
             says=("head.sample", "head.command", "node.event"),
             pacing="arrival",
             priority=48,
+            reflex=True,
             answer="whisk.command",
         ),
         Process(
@@ -65,6 +68,7 @@ PROCESSES: Final[dict[str, Process]] = {
             says=("whisk.command", "whisk.cycle", "whisk.calibration", "node.event"),
             pacing="arrival",
             priority=46,
+            reflex=True,
         ),
         Process(
             "arm",

@@ -40,10 +40,12 @@ class Strike:
 
     process: str
     number: signal.Signals
-    go_on_after: float | None = None
+    pause_s: float = 0.0
+    """When to let it go on, s after the strike; 0 for never."""
     supervisor: Supervisor | None = None
     struck_s: float | None = None
     """Logical time of the strike, s."""
+    resumed: bool = False
 
     def __call__(self, _progress: Progress) -> None:
         assert self.supervisor is not None
@@ -54,18 +56,18 @@ class Strike:
         if self.struck_s is None and now >= STRIKE_S:
             self.struck_s = now
             os.kill(pid, self.number)
-        elif self.struck_s is not None and self.go_on_after is not None:
-            if now >= self.struck_s + self.go_on_after:
-                self.go_on_after = None
+        if self.struck_s and self.pause_s and not self.resumed:
+            self.resumed = now >= self.struck_s + self.pause_s
+            if self.resumed:
                 os.kill(pid, signal.SIGCONT)
 
 
 def bench(out: Path, duration: float, on_progress: OnProgress) -> Bench:
-    """Strike every process in turn; each run lasts `duration`, LAST_S at most, if nothing ends it."""
+    """Strike every process in turn; a run that nothing ends lasts `duration`, at most LAST_S."""
     length = min(duration, LAST_S)
     strikes = [
         Strike("recorder", signal.SIGKILL),
-        Strike("recorder", signal.SIGSTOP, go_on_after=STOPPED_S),
+        Strike("recorder", signal.SIGSTOP, pause_s=STOPPED_S),
         Strike("recorder", signal.SIGSTOP),
         *(Strike(name, signal.SIGKILL) for name in PROCESSES),
     ]
@@ -105,7 +107,7 @@ def how(strike: Strike) -> str:
     """A strike in words."""
     if strike.number == signal.SIGKILL:
         return "killed"
-    return "stopped for good" if strike.go_on_after is None else f"stopped for {STOPPED_S:g} s"
+    return f"stopped for {strike.pause_s:g} s" if strike.pause_s else "stopped for good"
 
 
 def last_angle(log: Path) -> float:
