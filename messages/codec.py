@@ -270,3 +270,15 @@ def header(frame: bytes) -> tuple[str, str, int, int, int]:
     codec = CODECS[topic_of(frame)]
     _, source, epoch, seq, t, *_ = codec._unpack(frame)
     return codec.topic, source, epoch, seq, t
+
+
+def epoch_of(frame: bytes, topic: str, source: str) -> int:
+    """The epoch of a frame whose topic and source are known. Raises DecodeError.
+
+    Reads the one byte that holds a small epoch behind a short source; else the whole header.
+    """
+    start = len(topic) + 1  # fixarray, version, fixstr and its characters, epoch
+    at = start + 3 + len(source)
+    if len(frame) > at and frame[start] & 0xF0 == 0x90 and len(source) < 32 and frame[at] < 0x80:
+        return frame[at]
+    return header(frame)[2]

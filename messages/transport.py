@@ -13,9 +13,11 @@ from __future__ import annotations
 
 import collections
 import ipaddress
+import os
+import re
+import socket
 from collections.abc import Iterable, Mapping
 from typing import Final, Protocol
-from urllib.parse import urlparse
 
 import msgpack
 import zmq
@@ -27,6 +29,7 @@ from vibrissa.messages.topics import TOPICS
 BUNDLE: Final = "bundle"
 """Not a topic of the table: what a bundled listener subscribes to."""
 _BUNDLE_PREFIX: Final = b"bundle\0"
+_TCP: Final = re.compile(r"tcp://(?:\[([^\[\]]+)\]|([^\[\]:/;@]+)):(\d{1,5})")
 
 
 class Port(Protocol):
@@ -76,22 +79,22 @@ class ZmqPort:
         self._out = context.socket(zmq.XPUB)
         self._in = context.socket(zmq.SUB)
         try:
-            self._out.set(zmq.XPUB_VERBOSE, 1)
+            self._out.set(zmq.XPUB_VERBOSER, 1)
             self._out.set(zmq.SNDHWM, 0)
+            self._out.set(zmq.MAXMSGSIZE, 1 << 12)  # of what comes in here: subscriptions
             self._out.set(zmq.LINGER, linger_ms)
             self._in.set(zmq.RCVHWM, 0)
             self._in.set(zmq.LINGER, 0)
             self._in.set(zmq.MAXMSGSIZE, 4 * MAX_FRAME_BYTES)
-            check_endpoint(endpoint)
-            try:
-                self._out.bind(endpoint)
-            except zmq.ZMQError as error:
-                raise TransportError(f"can't bind {endpoint}: {error.strerror}") from None
+            bind(self._out, endpoint)
             for topic in [BUNDLE.encode()] if bundled else sorted(self._topics):
                 self._in.subscribe(topic + b"\0")
             for other in connect:
                 check_endpoint(other)
-                self._in.connect(other)
+                try:
+                    self._in.connect(other)
+                except zmq.ZMQError as error:
+                    raise TransportError(f"can't connect to {other}: {error.strerror}") from None
         except Exception:
             self.close()
             raise
@@ -144,18 +147,20 @@ class ZmqPort:
             try:
                 note = self._out.recv(zmq.NOBLOCK)
             except zmq.Again:
-                self._heard = {t.encode() for t, n in self._subscribers.items() if n > 0}
-                self._bundling = self._subscribers[BUNDLE] > 0
                 return self._subscribers
             topic = note[1:].removesuffix(b"\0").decode(errors="replace")
             if topic != BUNDLE and topic not in TOPICS:
                 continue
             if note[:1] == b"\x01":
                 self._subscribers[topic] += 1
+                self._heard.add(topic.encode())  # for good: a stranger can't unsubscribe others
+                self._bundling |= topic == BUNDLE
             elif note[:1] == b"\x00":
                 self._subscribers[topic] -= 1
 
     def close(self) -> None:
+        if not self._out.closed:
+            self.flush()
         self._in.close()
         self._out.close()
 
@@ -202,20 +207,37 @@ class MemoryPort:
 
 def check_endpoint(endpoint: str) -> None:
     """Refuse what is not on this machine. Raises TransportError."""
-    url = urlparse(endpoint)
-    if url.scheme == "ipc" and len(endpoint) - len("ipc://") <= zmq.IPC_PATH_MAX_LEN:
+    if endpoint.startswith("ipc://"):
+        if not 0 < len(os.fsencode(_ipc_path(endpoint))) <= zmq.IPC_PATH_MAX_LEN:
+            raise TransportError(
+                f"endpoint {endpoint}: expected a path of 1 to {zmq.IPC_PATH_MAX_LEN} bytes"
+            )
         return
-    if url.scheme == "ipc":
-        raise TransportError(
-            f"endpoint {endpoint}: expected a path of at most {zmq.IPC_PATH_MAX_LEN} characters"
-        )
-    if url.scheme != "tcp":
-        raise TransportError(f"endpoint {endpoint}: expected ipc:// or tcp://")
-    if not _loopback(url.hostname or ""):
+    address = _TCP.fullmatch(endpoint)
+    if address is None or not 0 < int(address[3]) < 2**16:
+        raise TransportError(f"endpoint {endpoint}: expected ipc://PATH or tcp://ADDRESS:PORT")
+    if not _loopback(address[1] or address[2]):
         raise TransportError(
             f"endpoint {endpoint}: expected an address of this machine (127.x.x.x, localhost, "
             "[::1]); others are refused because traffic is not encrypted"
         )
+
+
+def bind(publisher: zmq.Socket[bytes], endpoint: str) -> None:
+    """Bind a socket to an endpoint of this machine. Raises TransportError, also when in use."""
+    check_endpoint(endpoint)
+    if endpoint.startswith("ipc://"):  # ZeroMQ would quietly take it from its owner
+        with socket.socket(socket.AF_UNIX) as probe:
+            if probe.connect_ex(_ipc_path(endpoint)) == 0:
+                raise TransportError(f"can't bind {endpoint}: Address already in use")
+    try:
+        publisher.bind(endpoint)
+    except zmq.ZMQError as error:
+        raise TransportError(f"can't bind {endpoint}: {error.strerror}") from None
+
+
+def _ipc_path(endpoint: str) -> str:
+    return endpoint.removeprefix("ipc://")
 
 
 def _loopback(host: str) -> bool:

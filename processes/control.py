@@ -12,8 +12,8 @@ from typing import Any
 import msgpack
 import zmq
 
-from vibrissa.messages.errors import DecodeError
-from vibrissa.messages.transport import check_endpoint
+from vibrissa.messages.errors import DecodeError, TransportError
+from vibrissa.messages.transport import bind, check_endpoint
 
 _FIELDS: dict[str, dict[str, type]] = {
     "hello": {"pid": int, "missing": list},
@@ -81,11 +81,14 @@ class ControlDesk:
     """The supervisor's end of the control channel."""
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str) -> None:
-        check_endpoint(endpoint)
         self._socket = context.socket(zmq.ROUTER)
         self._socket.set(zmq.LINGER, 0)
         self._socket.set(zmq.MAXMSGSIZE, _MAX_BYTES)
-        self._socket.bind(endpoint)
+        try:
+            bind(self._socket, endpoint)
+        except TransportError:
+            self._socket.close()
+            raise
 
     def say(self, name: str, kind: str, **fields: Any) -> None:
         self._socket.send_multipart([name.encode(), pack(kind, **fields)], zmq.NOBLOCK)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import collections
 import contextlib
 import dataclasses
+import gc
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -18,9 +19,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from vibrissa.messages.codec import decode, header
+from vibrissa.messages.codec import decode, epoch_of, header
 from vibrissa.messages.errors import MessageError
-from vibrissa.messages.log_format import LogError
+from vibrissa.messages.log_format import LogError, Record
 from vibrissa.messages.log_reader import LogReader
 from vibrissa.messages.topics import TOPICS
 from vibrissa.processes import provenance
@@ -230,8 +231,20 @@ def verify(
         )
     names = reader.metadata.get("nodes", ",".join(PROCESSES)).split(",")
     notes = provenance.mismatches(reader.metadata)
-    with _runners(executor, names, experiment, replacements) as runners:
+    with _runners(executor, names, experiment, replacements) as runners, _no_collections():
         return _verify(reader, experiment, executor, runners, notes, on_progress)
+
+
+@contextlib.contextmanager
+def _no_collections() -> Iterator[None]:
+    """Without the cyclic garbage collector: a re-run holds many objects and makes no cycles."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
 
 
 @contextlib.contextmanager
@@ -254,11 +267,12 @@ def _verify(
     on_progress: OnProgress,
 ) -> Verdict:
     checks = {r.name: NodeCheck(r) for r in runners}
+    router = Router(checks)
     began = time.monotonic()
     t, stop_at = 0, None
     try:
         for count, record in enumerate(reader):
-            _route(frame_of(record), record.topic, record.source, record.seq, checks)
+            router.take(record)
             t = max(t, record.t)
             if count % PUMP_RECORDS == 0:
                 _pump(checks)
@@ -306,22 +320,34 @@ def first_cause(findings: Sequence[Finding]) -> Difference | None:
     return min(roots, key=lambda f: f.t).difference if roots else None
 
 
-def _route(frame: bytes, topic: str, source: str, seq: int, checks: dict[str, NodeCheck]) -> None:
-    producer = checks.get(source)
-    if topic == "node.receipt":
-        if producer is not None:
-            producer.add_receipts(frame)
-        return
-    row = TOPICS.get(topic)
-    if row is None or topic == "node.telemetry":
-        return
-    if producer is not None and row.compared:
-        producer.add_output(topic, frame)
-    stream = None
-    for name, check in checks.items():
-        if topic in PROCESSES[name].hears and (topic != "host.event" or name == source):
-            stream = stream or (topic, source, header(frame)[2])
-            check.add_input(stream, seq, frame)
+class Router:
+    """Hands every record to the checks of the nodes that said or heard it."""
+
+    def __init__(self, checks: dict[str, NodeCheck]) -> None:
+        self._checks = checks
+        self._hearers = {
+            topic: [check for name, check in checks.items() if topic in PROCESSES[name].hears]
+            for topic in TOPICS
+        }
+
+    def take(self, record: Record) -> None:
+        """Raises UnusableLogError for receipts and DecodeError for messages that can't be read."""
+        topic, source, seq, _, _ = record
+        producer = self._checks.get(source)
+        if topic == "node.receipt" and producer is not None:
+            producer.add_receipts(frame_of(record))
+        row = TOPICS.get(topic)
+        if row is None or topic in ("node.receipt", "node.telemetry"):
+            return
+        frame = frame_of(record)
+        if producer is not None and row.compared:
+            producer.add_output(topic, frame)
+        hearers = self._hearers[topic]
+        if hearers:
+            stream = (topic, source, epoch_of(frame, topic, source))
+            for check in hearers:
+                if topic != "host.event" or check is producer:
+                    check.add_input(stream, seq, frame)
 
 
 def _pump(checks: dict[str, NodeCheck]) -> None:

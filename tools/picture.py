@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -28,7 +28,7 @@ from vibrissa.rig.maze import Maze, parse_maze
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from vibrissa.messages.types import SlamPose, Telemetry
+    from vibrissa.messages.types import SlamMap, SlamPose, Telemetry, WhiskCalibration
     from vibrissa.processes.config import Experiment
 
 Floats = npt.NDArray[np.float64]
@@ -47,8 +47,9 @@ class Story:
     truth: list[tuple[float, ...]] = field(default_factory=list)
     odometry: list[tuple[float, ...]] = field(default_factory=list)
     first: SlamPose | None = None
-    map: Any = None
-    calibration: Any = None
+    map: SlamMap | None = None
+    calibration: WhiskCalibration | None = None
+    calibrated_s: float = 0.0
     contacts: dict[int, npt.NDArray[np.bool_]] = field(default_factory=dict)
     answered: int = 0
     samples: int = 0
@@ -68,7 +69,7 @@ class Story:
             case "slam.map":
                 self.map = body
             case "whisk.calibration":
-                self.calibration = body
+                self.calibration, self.calibrated_s = body, message.t * 1e-9
             case "node.telemetry":
                 self.telemetry.setdefault(message.source, []).append(body)
             case "head.sample":
@@ -228,7 +229,7 @@ def draw_contacts(ax: Axes, story: Story) -> None:
         t = [row * BIN_TICKS / TICK_HZ for row, on in story.contacts.items() if on[whisker]]
         colour = RING_COLOURS[whisker // (WHISKERS // len(RINGS))]
         ax.plot(t, np.full(len(t), whisker), "|", ms=7, mew=1, color=colour)
-    ax.axvspan(0, story.experiment.calibration_ticks / TICK_HZ, color="0.92")
+    ax.axvspan(0, story.calibrated_s, color="0.92")
     ax.set_xlim(0, story.samples / TICK_HZ or 1)
     ax.set_ylim(WHISKERS - 0.5, -0.5)
     ax.set_yticks(range(WHISKERS), [str(i) for i in range(WHISKERS)], fontsize=7)
