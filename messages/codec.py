@@ -224,8 +224,8 @@ def _shared(field: Array) -> bool:
 
 
 def _identity_fault(source: Any, epoch: Any, seq: Any, t: Any) -> str | None:
-    """What is wrong with an identity; sources are words, because receipts list them in a line."""
-    named = type(source) is str and 0 < len(source) <= 40
+    """What is wrong with an identity; sources are ASCII words, as receipts list them in a line."""
+    named = type(source) is str and 0 < len(source) <= 40 and source.isascii()
     if not named or not source.isprintable() or " " in source:
         return f"expected a source name, found {_short(source)}"
     for (name, field), value in zip(_NUMBERS.items(), (epoch, seq, t), strict=True):

@@ -20,7 +20,8 @@ from vibrissa.messages.fields import Array, Field, Int, Real, Text
 from vibrissa.numerics import compiled
 
 HEADER_CHECK = (
-    "type(source) is str and 0 < len(source) <= 40 and source.isprintable() and ' ' not in source"
+    "type(source) is str and 0 < len(source) <= 40"
+    " and source.isascii() and source.isprintable() and ' ' not in source"
     f" and type(epoch) is int and 0 <= epoch < {2**63} and type(seq) is int"
     f" and 0 <= seq < {2**32} and type(t) is int and {-(2**63)} <= t < {2**63}"
 )

@@ -211,6 +211,61 @@ class Event:
 
 
 @dataclass(slots=True, eq=False)
+class Order:
+    """What a person or a schedule asks of a running node; the node named obeys or refuses."""
+
+    version: ClassVar[int] = 1
+    request: Annotated[int, Int(0, 2**31, "number of the request; answers repeat it")]
+    kind: Annotated[str, Text(40)]
+    """open, assign, register, swap, rollback, forget, set"""
+    node: Annotated[str, Text(40)]
+    """Who is to obey: "sampler" for the arbiter's orders, else the node concerned."""
+    name: Annotated[str, Text(200)]
+    """The controller, slot or parameter that is meant."""
+    value: Annotated[str, Text(2000)]
+    """A parameter's value, or parameters of a controller, as JSON."""
+    at: TickOrNone
+    """Tick at which it is to take effect, -1 for as soon as possible."""
+    blend_ticks: Annotated[int, Int(0, 100_000)]
+
+
+@dataclass(slots=True, eq=False)
+class Answer:
+    """What became of an order."""
+
+    version: ClassVar[int] = 1
+    request: Annotated[int, Int(0, 2**31)]
+    tick: TickOrNone
+    accepted: Annotated[int, Int(0, 1)]
+    node: Annotated[str, Text(40)]
+    text: Annotated[str, Text(400)]
+
+
+@dataclass(slots=True, eq=False)
+class Ownership:
+    """From `tick` on the drives obey `controller`, the source of commands of that epoch."""
+
+    version: ClassVar[int] = 1
+    tick: Tick
+    controller: Annotated[str, Text(40)]
+    epoch: Annotated[int, Int(0, 2**31)]
+
+
+@dataclass(slots=True, eq=False)
+class ShadowStatus:
+    """How a controller in shadow compares with the owner of the drives, over the last second."""
+
+    version: ClassVar[int] = 1
+    tick: Tick
+    controller: Annotated[str, Text(40)]
+    epoch: Annotated[int, Int(0, 2**31)]
+    fresh: Annotated[int, Int(0, TICK_LIMIT, "ticks in a row answered on time")]
+    late: Annotated[int, Int(0, TICK_LIMIT, "answers that came after the next sample")]
+    mean_divergence: Annotated[float, Real(1e3, "rad from the routed command")]
+    max_divergence: Annotated[float, Real(1e3, "rad from the routed command")]
+
+
+@dataclass(slots=True, eq=False)
 class Receipt:
     """What a node consumed, step by step, and what came of it.
 

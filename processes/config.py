@@ -6,6 +6,8 @@ every node of the run.
 
 from __future__ import annotations
 
+import itertools
+import math
 import tomllib
 from collections.abc import Iterator
 from importlib import resources
@@ -66,7 +68,10 @@ class Head(Section):
 class Whisk(Section):
     """[whisk]"""
 
-    controller: Annotated[str, Field(description="open_loop or rcp")] = "rcp"
+    controller: Annotated[str, Field(description="open_loop, rcp, or one that was added")] = "rcp"
+    parameters: Annotated[
+        dict[str, float | int | bool | str], Field(description="of a controller that was added")
+    ] = {}
     period: Annotated[float, Field(ge=0.2, le=10, description="s per whisk cycle")] = 1.0
     calibration_cycles: Annotated[int, Field(ge=1, le=1000)] = 4
     rcp_gain: Annotated[float, Field(ge=0, le=1000, description="in contact stiffnesses")] = 3.0
@@ -99,6 +104,14 @@ class Slam(Section):
     odometry_noise: Annotated[str, Field(description="named odometry noise model")] = "none"
 
 
+class Swap(Section):
+    """[[swap]]: a controller that takes over at the start of a whisk cycle."""
+
+    at_cycle: Annotated[int, Field(ge=1, le=10**7)]
+    to: Annotated[str, Field(min_length=1, max_length=40, description="name of a controller")]
+    blend: Annotated[float, Field(ge=0, le=10, description="s, from old command to new")] = 0.0
+
+
 class Experiment(Section):
     """A whole experiment file."""
 
@@ -108,6 +121,14 @@ class Experiment(Section):
     whisk: Whisk = Whisk()
     arm: Arm = Arm()
     slam: Slam = Slam()
+    controllers: Annotated[
+        dict[
+            Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,39}$")],
+            Annotated[str, Field(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")],
+        ],
+        Field(description='[controllers]: name = "module:Class"'),
+    ] = {}
+    swap: list[Swap] = []
 
     @property
     def ticks(self) -> int:
@@ -136,7 +157,22 @@ class Experiment(Section):
                 if node in seen:
                     raise ValueError(f"run.together: {node!r} is named twice")
                 seen.add(node)
+        cycles = [swap.at_cycle for swap in self.swap]
+        if any(later - earlier < 2 for earlier, later in itertools.pairwise(cycles)):
+            raise ValueError("swap: expected at_cycle to grow by at least 2 from entry to entry")
         return self
+
+
+LEAST_SLEW_LIMIT = 0.005
+"""Largest change of a command per tick, rad, unless fast whisking itself needs more."""
+
+
+def slew_limit(experiment: Experiment) -> float:
+    """rad per tick: what no command may exceed, a fifth above the whisk's own steepest change."""
+    from vibrissa.control.kinematics import paper_head
+
+    swing = float(paper_head().swing.max())
+    return max(LEAST_SLEW_LIMIT, 1.2 * swing * math.pi / experiment.period_ticks)
 
 
 def load_experiment(
@@ -183,14 +219,15 @@ def load_experiment(
 def _check_parts(experiment: Experiment, where: str) -> None:
     """What only the nodes' own modules can judge: maze, circuit, controller, RatSLAM parameters."""
     from vibrissa.processes.arm import make_path
+    from vibrissa.processes.controllers import available
     from vibrissa.processes.slam import make_slam_config
-    from vibrissa.processes.whisk import CONTROLLERS
 
-    name = experiment.whisk.controller
-    if name not in CONTROLLERS:
-        raise RunError(
-            f"{where}: whisk.controller {name!r}: expected one of {', '.join(CONTROLLERS)}"
-        )
+    known = available(experiment)
+    named = [("whisk.controller", experiment.whisk.controller)]
+    named += [("swap.to", swap.to) for swap in experiment.swap]
+    for key, name in named:
+        if name not in known:
+            raise RunError(f"{where}: {key} {name!r}: expected one of {', '.join(known)}")
     try:
         make_path(experiment)
         make_slam_config(experiment)

@@ -31,7 +31,7 @@ from vibrissa.processes.node import Step, Stepper, counters, timer_frame
 from vibrissa.processes.receipts import ReceiptBook
 from vibrissa.processes.rehearsal import rehearse
 from vibrissa.processes.stats import Clocking
-from vibrissa.processes.table import PROCESSES, Process, build
+from vibrissa.processes.table import ROWS, Process, build
 
 HOUSEKEEPING_NS: Final = 50_000_000
 """How often receipts are handed in, so that a crash costs few."""
@@ -74,7 +74,7 @@ class Host:
         self.name = name
         self.layout = layout
         self.nodes = layout.hosts[name]
-        rows = [PROCESSES[n] for n in self.nodes]
+        rows = [ROWS[n] for n in self.nodes]
         self.pacing = rows[0].pacing
         experiment = Experiment.model_validate_json(layout.experiment)
         self.last_tick = experiment.ticks

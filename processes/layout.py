@@ -9,7 +9,7 @@ from pathlib import Path
 
 from vibrissa.messages.topics import TOPICS
 from vibrissa.messages.transport import BUNDLE
-from vibrissa.processes.table import PROCESSES, PUBLISHED_BY_HOSTS
+from vibrissa.processes.table import PUBLISHED_BY_HOSTS, ROWS
 
 SUPERVISOR_SAYS = ("run.event",)
 SUPERVISOR_HEARS = ("node.event",)
@@ -44,7 +44,7 @@ class Layout:
         if process == "recorder":
             return []
         nodes = self.hosts[process]
-        return sorted({t for n in nodes for t in PROCESSES[n].says} | set(PUBLISHED_BY_HOSTS))
+        return sorted({t for n in nodes for t in ROWS[n].says} | set(PUBLISHED_BY_HOSTS))
 
     def hears(self, process: str) -> list[str]:
         """Topics a process subscribes to at the others."""
@@ -53,7 +53,7 @@ class Layout:
         if process == "recorder":
             return [t.name for t in TOPICS.values() if t.recorded]
         nodes = self.hosts[process]
-        wanted = {t for n in nodes for t in PROCESSES[n].hears}
+        wanted = {t for n in nodes for t in ROWS[n].hears}
         return sorted(t for t in wanted if self.speakers(t) - {process})
 
     def speakers(self, topic: str) -> set[str]:
@@ -67,7 +67,7 @@ class Layout:
         """Whether a process takes what it hears in bundles: nothing in it reacts at once."""
         nodes = self.hosts.get(process, [])
         return process == "recorder" or (
-            bool(nodes) and all(PROCESSES[n].pacing == "drain" for n in nodes)
+            bool(nodes) and all(ROWS[n].pacing == "drain" for n in nodes)
         )
 
     def connections(self, process: str) -> list[str]:

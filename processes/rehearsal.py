@@ -17,7 +17,7 @@ from vibrissa.messages.codec import CODECS
 from vibrissa.messages.types import TICK_NS, WHISKERS
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.node import Node, Stepper
-from vibrissa.processes.table import PROCESSES, build
+from vibrissa.processes.table import ROWS, build
 
 TICKS = 1600
 PERIOD = 400
@@ -40,7 +40,7 @@ def rehearse(name: str, experiment: Experiment) -> None:
 def rehearse_node(name: str, node: Node) -> None:
     """Step a throw-away node as if it were `name` in a short run."""
     stepper = Stepper(name, node)
-    hears = set(PROCESSES[name].hears)
+    hears = set(ROWS[name].hears)
     for topic, source, seq, t, body in _made_up_run():
         if topic in hears:
             stepper.step(CODECS[topic].encode(source, 0, seq, t, body))

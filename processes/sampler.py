@@ -5,10 +5,16 @@ from __future__ import annotations
 from vibrissa.control.arbiter import NO_TICK, RETRACT, Arbiter, ControllerId, Decision, Routing
 from vibrissa.control.kinematics import paper_head
 from vibrissa.messages.codec import Message
-from vibrissa.messages.types import Event, HeadCommand, HeadReading, HeadSample, WhiskCommand
-from vibrissa.processes.config import Experiment
+from vibrissa.messages.types import (
+    Event,
+    HeadCommand,
+    HeadReading,
+    HeadSample,
+    Ownership,
+    WhiskCommand,
+)
+from vibrissa.processes.config import Experiment, slew_limit
 from vibrissa.processes.node import Output
-from vibrissa.processes.whisk import slew_limit
 
 CONTROLLER = ControllerId("whisk")
 RECOVERY_TICKS = 200
@@ -103,6 +109,7 @@ class SamplerNode:
             outputs.append(_event(routing.decision))
             self._fell_back_late = routing.decision.cause.startswith("no command")
             self._punctual = 0
+            outputs.append(_owner(tick, self._arbiter.active))
         if routing.command is not None:
             name = self._arbiter.active.name
             self._answered += 1
@@ -117,7 +124,12 @@ class SamplerNode:
 
     def _route(self, controller: ControllerId) -> list[Output]:
         self._fell_back_late = False
-        return [_event(self._arbiter.route(controller))]
+        decision = self._arbiter.route(controller)
+        return [_event(decision), _owner(max(decision.tick, NO_TICK) + 1, controller)]
+
+
+def _owner(tick: int, controller: ControllerId) -> Output:
+    return "head.owner", Ownership(tick, controller.name, controller.epoch)
 
 
 def _event(decision: Decision) -> Output:

@@ -35,7 +35,7 @@ from vibrissa.processes.config import RETRACT_S, Experiment
 from vibrissa.processes.control import ControlDesk
 from vibrissa.processes.layout import Layout
 from vibrissa.processes.results import OnProgress, Progress, RunError, silent
-from vibrissa.processes.table import PROCESSES, RECORDER_SILENCE
+from vibrissa.processes.table import PROCESSES, RECORDER_SILENCE, ROWS
 
 LEAD_S: Final = 0.25
 """From the go to tick 0."""
@@ -187,9 +187,7 @@ class Supervisor:
         command = [sys.executable, "-m", "vibrissa.processes.main", name, str(folder)]
         popen = subprocess.Popen(command, env=environment, start_new_session=True)
         nodes = self.layout.hosts.get(name)
-        silence = (
-            min(PROCESSES[n].silence for n in nodes) if nodes is not None else RECORDER_SILENCE
-        )
+        silence = min(ROWS[n].silence for n in nodes) if nodes is not None else RECORDER_SILENCE
         self.children[name] = Child(name, popen, silence)
 
     def _warm(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
@@ -54,8 +55,15 @@ PROCESSES: Final[dict[str, Process]] = {
         Process(
             "sampler",
             "vibrissa.processes.sampler:SamplerNode",
-            hears=("rig.sample", "whisk.command", "run.event", "host.event"),
-            says=("head.sample", "head.command", "node.event"),
+            hears=("rig.sample", "whisk.command", "run.order", "run.event", "host.event"),
+            says=(
+                "head.sample",
+                "head.command",
+                "head.owner",
+                "head.shadow",
+                "node.answer",
+                "node.event",
+            ),
             pacing="arrival",
             priority=48,
             reflex=True,
@@ -64,8 +72,14 @@ PROCESSES: Final[dict[str, Process]] = {
         Process(
             "whisk",
             "vibrissa.processes.whisk:WhiskNode",
-            hears=("head.sample", "run.event"),
-            says=("whisk.command", "whisk.cycle", "whisk.calibration", "node.event"),
+            hears=("head.sample", "head.owner", "run.order", "run.calibration", "run.event"),
+            says=(
+                "whisk.command",
+                "whisk.cycle",
+                "whisk.calibration",
+                "node.answer",
+                "node.event",
+            ),
             pacing="arrival",
             priority=46,
             reflex=True,
@@ -90,6 +104,16 @@ PROCESSES: Final[dict[str, Process]] = {
     )
 }
 
+SLOTS: Final[dict[str, Process]] = {
+    name: dataclasses.replace(PROCESSES["whisk"], name=name, priority=44)
+    for name in (f"whisk.{number}" for number in range(1, 8))
+}
+"""Empty places for controllers that are loaded while a run goes on: whisk processes that give way
+to the first one. Everybody who listens to controllers listens here from the start, so that a
+newcomer needs nothing from the 2 kHz loop."""
+
+ROWS: Final = PROCESSES | SLOTS
+
 RECORDER_SILENCE: Final = 10.0
 """Seconds a recorder may be stopped before the run ends; publishers hold its messages meanwhile."""
 
@@ -99,8 +123,9 @@ PUBLISHED_BY_HOSTS: Final = ("host.event", "node.receipt", "node.telemetry")
 
 def build(name: str, experiment: Experiment) -> Node:
     """A fresh node of the table in its initial state, made from the experiment alone."""
-    module, _, attribute = PROCESSES[name].node.partition(":")
-    node: Node = getattr(importlib.import_module(module), attribute)(experiment)
+    module, _, attribute = ROWS[name].node.partition(":")
+    make = getattr(importlib.import_module(module), attribute)
+    node: Node = make(experiment, name) if name in SLOTS else make(experiment)
     return node
 
 
@@ -112,8 +137,8 @@ def listeners(topic: str) -> list[str]:
 def producers(topic: str) -> list[str]:
     """The processes that may say a topic."""
     if topic in PUBLISHED_BY_HOSTS:
-        return list(PROCESSES)
+        return list(ROWS)
     row = TOPICS[topic]
     if row.producer == "supervisor":
         return ["supervisor"]
-    return [p.name for p in PROCESSES.values() if topic in p.says]
+    return [p.name for p in ROWS.values() if topic in p.says]

@@ -46,7 +46,7 @@ from vibrissa.processes.results import (
     Verdict,
     silent,
 )
-from vibrissa.processes.table import PROCESSES
+from vibrissa.processes.table import PROCESSES, ROWS
 
 PUMP_RECORDS: Final = 4000
 AFTERMATH_NS: Final = 500_000_000
@@ -326,7 +326,7 @@ class Router:
     def __init__(self, checks: dict[str, NodeCheck]) -> None:
         self._checks = checks
         self._hearers = {
-            topic: [check for name, check in checks.items() if topic in PROCESSES[name].hears]
+            topic: [check for name, check in checks.items() if topic in ROWS[name].hears]
             for topic in TOPICS
         }
 

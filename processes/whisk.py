@@ -2,106 +2,145 @@
 
 from __future__ import annotations
 
-import math
+import json
 
 import numpy as np
 
 from vibrissa.control.calibration import Calibration, CalibrationError, Calibrator
 from vibrissa.control.controller import Controller
-from vibrissa.control.kinematics import paper_head
-from vibrissa.control.open_loop import OpenLoop
-from vibrissa.control.rcp import Rcp, RcpParams, normalised_gain
-from vibrissa.control.whisk_pattern import full_whisk
 from vibrissa.messages.codec import Message
 from vibrissa.messages.types import (
-    TICK_HZ,
+    TICK_NS,
     WHISKERS,
+    Answer,
     Event,
     HeadSample,
+    Order,
+    Ownership,
     WhiskCalibration,
     WhiskCommand,
     WhiskCycle,
 )
 from vibrissa.processes.config import Experiment
+from vibrissa.processes.controllers import make_controller
 from vibrissa.processes.node import Output
-
-CONTROLLERS = ("open_loop", "rcp")
-
+from vibrissa.processes.results import RunError
 
 DISTURBANCE = 0.02
 """Largest distance of the drives' command from the controller's in free whisking, rad."""
 MOST_ATTEMPTS = 20
-LEAST_SLEW_LIMIT = 0.005
-"""Largest change of a command per tick, rad, unless fast whisking itself needs more."""
-
-
-def slew_limit(experiment: Experiment) -> float:
-    """rad per tick: what no command may exceed, a fifth above the whisk's own steepest change."""
-    swing = float(paper_head().swing.max())
-    return max(LEAST_SLEW_LIMIT, 1.2 * swing * math.pi / experiment.period_ticks)
-
-
-def make_controller(experiment: Experiment) -> Controller:
-    """The controller an experiment names, one of CONTROLLERS."""
-    whisk = full_whisk(paper_head(), experiment.period_ticks, slew_limit(experiment))
-    settings = experiment.whisk
-    if settings.controller == "open_loop":
-        return OpenLoop(whisk)
-    window = max(round(settings.rcp_window * TICK_HZ), 1)
-    return Rcp(RcpParams(whisk, normalised_gain(settings.rcp_gain), window))
 
 
 class WhiskNode:
     """Answers every sample with a command, and tells when a whisk cycle is complete.
 
+    The run's first controller starts with it; a slot is empty until an order assigns one, which
+    then answers in shadow until the arbiter makes it the owner of the drives.
+
     For the first cycles the head is held free: what the whiskers feel then is the calibration. A
     touch during calibration is a fault that ends the run, because the thresholds would be blind.
     Cycles in which the drives did not get what was commanded are no free whisking; calibration
-    starts over after them.
+    starts over after them. A controller that comes later is handed the calibration.
     """
 
-    def __init__(self, experiment: Experiment) -> None:
+    def __init__(self, experiment: Experiment, name: str = "whisk") -> None:
+        self.name = name
+        self._experiment = experiment
         self._period = experiment.period_ticks
         self._calibration_cycles = experiment.whisk.calibration_cycles
-        self._calibrator: Calibrator | None = self._fresh_calibrator()
         self._disturbed = False
         self._attempts = 1
-        self._controller = make_controller(experiment)
-        self._active = False
+        self._controller: Controller | None = None
+        self._calibrator: Calibrator | None = None
+        if name == "whisk":
+            self._controller = make_controller(experiment.whisk.controller, experiment)
+            self._calibrator = self._fresh_calibrator()
+        self._calibration: Calibration | None = None
+        self._owner = False
+        self._change: Ownership | None = None
+        self._awake = False
         self._cycle_start = 0
         self._command = np.zeros(WHISKERS, np.float32)
         self._protraction = np.zeros(WHISKERS, np.float32)
         self._cycles = 0
 
     def step(self, message: Message) -> list[Output]:
-        if message.topic != "head.sample":
-            return []
-        sample: HeadSample = message.body
+        match message.topic:
+            case "head.sample":
+                return [] if self._controller is None else self._answer(message.body)
+            case "head.owner":
+                self._change = message.body
+            case "run.calibration":
+                self._calibration = from_message(message.body)
+            case "run.order" if message.body.node == self.name:
+                return self._obey(message.body, message.t // TICK_NS)
+        return []
+
+    def counters(self) -> dict[str, int]:
+        """Whisk cycles completed as the owner of the drives."""
+        return {"cycles": self._cycles}
+
+    def _answer(self, sample: HeadSample) -> list[Output]:
+        controller = self._controller
+        assert controller is not None
         tick = sample.tick
         outputs: list[Output] = []
-        if not self._active:
-            self._active = True
+        if self._change is not None and tick >= self._change.tick:
+            self._own(self._change.controller == self.name)
+        if not self._awake:
+            self._awake = True
             self._cycle_start = tick
-            self._controller.activate(tick, sample.command, sample.theta)
+            controller.activate(tick, sample.command, sample.theta)
             self._command = sample.command
         if self._calibrator is not None:
             off = np.abs(sample.command - self._command).max()
             self._disturbed |= bool(off > DISTURBANCE)
-        command = self._command = self._controller.step(tick, sample.theta, sample.x, sample.y)
+        command = self._command = controller.step(tick, sample.theta, sample.x, sample.y)
         outputs.append(("whisk.command", WhiskCommand(tick, command)))
         np.maximum(self._protraction, command, out=self._protraction)
         calibrating = self._calibrator is not None
         if self._calibrator is not None:
             outputs += self._calibrate(self._calibrator, sample)
         if (tick + 1) % self._period == 0:
-            outputs.append(("whisk.cycle", self._cycle(tick, calibrating)))
+            cycle = self._cycle(tick, calibrating)
+            if self._owner:
+                self._cycles += 1
+                outputs.append(("whisk.cycle", cycle))
             if self._disturbed:
                 outputs += self._start_over(tick)
         return outputs
 
-    def counters(self) -> dict[str, int]:
-        """Whisk cycles completed."""
-        return {"cycles": self._cycles}
+    def _own(self, owner: bool) -> None:
+        """Become or cease to be the owner; whoever gains the drives starts from what they hold."""
+        self._change = None
+        if owner and not self._owner:
+            self._awake = False
+        self._owner = owner
+
+    def _obey(self, order: Order, tick: int) -> list[Output]:
+        try:
+            text = self._assign(order) if order.kind == "assign" else self._set(order)
+            accepted = 1
+        except (RunError, ValueError) as error:
+            text, accepted = str(error), 0
+        return [("node.answer", Answer(order.request, tick, accepted, self.name, text[:400]))]
+
+    def _assign(self, order: Order) -> str:
+        controller = make_controller(order.name, self._experiment, order.value)
+        if getattr(controller, "needs_calibration", False):
+            if self._calibration is None:
+                raise RunError(f"controller {order.name} needs a calibration, there is none yet")
+            controller.calibrate(self._calibration)
+        self._controller = controller
+        self._awake = False
+        return f"{order.name} answers in shadow"
+
+    def _set(self, order: Order) -> str:
+        setter = getattr(self._controller, "set_parameter", None)
+        if order.kind != "set" or setter is None:
+            raise RunError(f"{self.name} can't be told to {order.kind} {order.name}")
+        setter(order.name, json.loads(order.value))
+        return f"{order.name} = {order.value}"
 
     def _fresh_calibrator(self) -> Calibrator:
         return Calibrator(self._calibration_cycles, self._period)
@@ -118,7 +157,9 @@ class WhiskNode:
             self._calibrator = None
             return [_fault(sample.tick, str(error))]
         self._calibrator = None
-        self._controller.calibrate(calibration)
+        self._calibration = calibration
+        if self._controller is not None:
+            self._controller.calibrate(calibration)
         return [("whisk.calibration", as_message(calibration))]
 
     def _start_over(self, tick: int) -> list[Output]:
@@ -146,7 +187,6 @@ class WhiskNode:
         )
         self._cycle_start = tick + 1
         self._protraction[:] = 0
-        self._cycles += 1
         return cycle
 
 
@@ -163,4 +203,16 @@ def as_message(calibration: Calibration) -> WhiskCalibration:
         threshold_y=calibration.threshold_y.astype(np.float32),
         mean_dy=calibration.mean_dy.astype(np.float32),
         threshold_dy=calibration.threshold_dy.astype(np.float32),
+    )
+
+
+def from_message(message: WhiskCalibration) -> Calibration:
+    """The calibration that travelled, as every controller that comes later gets it."""
+    return Calibration(
+        mean_y=message.mean_y.astype(np.float64),
+        sigma_y=message.sigma_y.astype(np.float64),
+        threshold_y=message.threshold_y.astype(np.float64),
+        mean_dy=message.mean_dy.astype(np.float64),
+        threshold_dy=message.threshold_dy.astype(np.float64),
+        samples=message.samples,
     )

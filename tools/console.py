@@ -24,11 +24,14 @@ Json = Annotated[bool, typer.Option("--json", help="Print pure JSON on stdout.")
 Log = Annotated[Path, typer.Argument(help="A recorded run: run.mcap, or the directory it is in.")]
 
 REFRESH_S = 0.2
+FILE_WIDTH = 120
+"""Columns of a table that goes to a file or a pipe."""
 
 
 def stdout() -> Console:
     """Where results go. Made when needed, so that a redirected stdout is respected."""
-    return Console(highlight=False, soft_wrap=True)
+    width = None if sys.stdout.isatty() else FILE_WIDTH
+    return Console(highlight=False, soft_wrap=True, width=width)
 
 
 def stderr() -> Console:

@@ -43,7 +43,7 @@ def topics() -> str:
 def processes() -> str:
     """The process table."""
     return _markdown(
-        ("process", "node", "hears", "says", "paced by", "SCHED_FIFO priority", "stand-in"),
+        ("process", "node", "hears", "says", "paced by", "priority", "reflex", "stand-in"),
         (
             (
                 f"`{row.name}`",
@@ -52,6 +52,7 @@ def processes() -> str:
                 _names(row.says),
                 row.pacing,
                 str(row.priority or "-"),
+                _yes(row.reflex),
                 _yes(row.source),
             )
             for row in PROCESSES.values()

@@ -1,9 +1,9 @@
 """Floors to measure a live run against: the least a message hop and a timed loop cost here.
 
-Both run in processes of their own with the real-time set-up of a live run, under SCHED_FIFO and
-under the ordinary scheduler. `echo` is two processes and two hops over ZeroMQ PUB/SUB on ipc:
-256-byte messages at 2 kHz, each sent back at once. `loop` sleeps to absolute deadlines at 2 kHz and
-does nothing else.
+Both run in processes of their own, once as such a program comes and once with the real-time set-up
+of the reflex loop (timer slack, SCHED_FIFO, a core of its own). `echo` is two processes and two
+hops over ZeroMQ PUB/SUB on ipc: 256-byte messages at 2 kHz, each sent back at once. `loop` sleeps
+to absolute deadlines at 2 kHz and does nothing else.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from vibrissa.processes import realtime
 from vibrissa.processes.results import RunError
 from vibrissa.processes.stats import Histogram
 
-SCHEDULERS: Final = {"ordinary": 0, "SCHED_FIFO": 48}
+SET_UPS: Final = ("as it comes", "set up like the reflex loop")
+PRIORITY: Final = 48
 BYTES: Final = 256
 WARM_TICKS: Final = 500
 REPEATS: Final = 2
@@ -34,21 +35,21 @@ Times = dict[str, float]
 
 
 def measure() -> list[dict[str, Times]]:
-    """Both floors under both schedulers, REPEATS times in turn; each {name: times}."""
+    """Both floors in both set-ups, REPEATS times in turn; each {name: times}."""
     found = []
     for _ in range(REPEATS):
         floors: dict[str, Times] = {}
-        for scheduler, priority in SCHEDULERS.items():
+        for set_up in SET_UPS:
             with tempfile.TemporaryDirectory(prefix="vibrissa-floor-") as folder:
-                echo = _start("echo", folder, priority)
+                echo = _start("echo", folder, set_up)
                 try:
-                    floors[f"bare echo ({scheduler}), latency"] = _result("ping", folder, priority)
+                    floors[f"bare echo, {set_up}, latency"] = _result("ping", folder, set_up)
                 finally:
                     echo.kill()
                     echo.communicate()
-                loop = _result("loop", folder, priority)
-            floors[f"bare loop ({scheduler}), lateness"] = loop["lateness"]
-            floors[f"bare loop ({scheduler}), period"] = loop["period"]
+                loop = _result("loop", folder, set_up)
+            floors[f"bare loop, {set_up}, lateness"] = loop["lateness"]
+            floors[f"bare loop, {set_up}, period"] = loop["period"]
         found.append(floors)
     return found
 
@@ -61,13 +62,13 @@ def medians(found: list[dict[str, Times]]) -> dict[str, Times]:
     }
 
 
-def _start(role: str, folder: str, priority: int) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", "vibrissa.tools.floors", role, folder, str(priority)]
+def _start(role: str, folder: str, set_up: str) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", "vibrissa.tools.floors", role, folder, set_up]
     return subprocess.Popen(command, stdout=subprocess.PIPE)
 
 
-def _result(role: str, folder: str, priority: int) -> dict[str, Any]:
-    process = _start(role, folder, priority)
+def _result(role: str, folder: str, set_up: str) -> dict[str, Any]:
+    process = _start(role, folder, set_up)
     text, _ = process.communicate(timeout=60)
     if process.returncode:
         raise RunError(f"the floor {role} could not be measured: exit code {process.returncode}")
@@ -75,8 +76,13 @@ def _result(role: str, folder: str, priority: int) -> dict[str, Any]:
     return found
 
 
-def _sockets(folder: str, mine: str, other: str, priority: int) -> tuple[Any, Any]:
-    realtime.prepare(priority)
+def _prepare(set_up: str) -> None:
+    if set_up != SET_UPS[0]:
+        realtime.prepare(PRIORITY, reflex=True)
+
+
+def _sockets(folder: str, mine: str, other: str, set_up: str) -> tuple[Any, Any]:
+    _prepare(set_up)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     out, back = context.socket(zmq.PUB), context.socket(zmq.SUB)
     out.bind(f"ipc://{folder}/{mine}")
@@ -85,15 +91,15 @@ def _sockets(folder: str, mine: str, other: str, priority: int) -> tuple[Any, An
     return out, back
 
 
-def _echo(folder: str, priority: int) -> None:
+def _echo(folder: str, set_up: str) -> None:
     realtime.die_with_parent()
-    out, back = _sockets(folder, "back", "out", priority)
+    out, back = _sockets(folder, "back", "out", set_up)
     while True:
         out.send(back.recv())
 
 
-def _ping(folder: str, priority: int) -> None:
-    out, back = _sockets(folder, "out", "back", priority)
+def _ping(folder: str, set_up: str) -> None:
+    out, back = _sockets(folder, "out", "back", set_up)
     payload = bytes(BYTES)
     deadline = time.monotonic() + 20
     while not back.poll(100):  # the first messages to a fresh subscriber are lost
@@ -114,8 +120,8 @@ def _ping(folder: str, priority: int) -> None:
     print(json.dumps(trip.summary()))
 
 
-def _loop(_folder: str, priority: int) -> None:
-    realtime.prepare(priority)
+def _loop(_folder: str, set_up: str) -> None:
+    _prepare(set_up)
     late, period = Histogram(), Histogram()
     start = time.monotonic_ns() + TICK_NS
     last = start
@@ -131,4 +137,4 @@ def _loop(_folder: str, priority: int) -> None:
 
 
 if __name__ == "__main__":
-    {"echo": _echo, "ping": _ping, "loop": _loop}[sys.argv[1]](sys.argv[2], int(sys.argv[3]))
+    {"echo": _echo, "ping": _ping, "loop": _loop}[sys.argv[1]](*sys.argv[2:4])

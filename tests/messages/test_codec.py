@@ -189,6 +189,7 @@ def test_a_body_of_another_type_is_refused(topic: str) -> None:
         ("x" * 41, 0, 0, 0),
         ("two lines\nof text", 0, 0, 0),
         ("two words", 0, 0, 0),
+        ("m\u00e4use", 0, 0, 0),
         ("\ud800", 0, 0, 0),
         (b"rig", 0, 0, 0),
         (None, 0, 0, 0),

@@ -397,6 +397,34 @@ def test_strangers_do_no_harm_to_a_publisher(zmq_bus: Bus) -> None:
     assert listener.receive(0) is None
 
 
+def test_a_stranger_can_not_unsubscribe_others(zmq_bus: Bus) -> None:
+    speaker = zmq_bus.speaker()
+    listener = zmq_bus.listener("head.sample")
+    zmq_bus.wait(speaker, head_sample=1)
+    with _raw_connection(zmq_bus._endpoints[0]) as stranger:
+        stranger.sendall(ZMTP_SUBSCRIBER)
+        greeting = b""
+        while not greeting.endswith(b"XPUB"):
+            greeting += stranger.recv(1)
+        stranger.sendall(_zmtp(b"\x00head.sample\0") * 5 + _zmtp(b"\x01arm.state\0"))
+        zmq_bus.wait(speaker, arm_state=1)  # so the others have been read as well
+        speaker.publish(says("head.sample", 1))
+        assert take(listener, 1) == [says("head.sample", 1)]
+
+
+def _zmtp(body: bytes) -> bytes:
+    """A message as it travels below ZeroMQ (ZMTP 3.0)."""
+    return bytes([0, len(body)]) + body
+
+
+READY = b"\x05READY\x0bSocket-Type\0\0\0\x03SUB"
+ZMTP_SUBSCRIBER = (
+    b"\xff" + bytes(8) + b"\x7f\x03\0" + b"NULL".ljust(20, b"\0") + bytes(32)
+    + bytes([4, len(READY)]) + READY
+)  # fmt: skip
+"""What a subscriber says first, after which any message is taken for a subscription."""
+
+
 @contextlib.contextmanager
 def _raw_connection(endpoint: str) -> Iterator[socket.socket]:
     """A bare stream to an endpoint, below ZeroMQ."""

@@ -108,7 +108,7 @@ def test_live_targets_name_every_aim_and_judge_it() -> None:
         "messages lost on recorded topics": False,
         "steps without receipt": True,
         "ticks answered within one period": True,
-        "latency p50 over p50 of the quicker bare echo": False,
+        "latency p50 over that of a bare echo in the same set-up": False,
         "processor use": True,
         "sampler and whisk in one process: ticks answered within the same tick": True,
         "sampler and whisk in one process: latency p50": True,
