@@ -200,3 +200,14 @@ class Rcp(LawController):
         self.parameters[THRESHOLD] = calibration.threshold_y
         self.state[SUM:] = 0.0
         self._calibrated = True
+
+    def set_parameter(self, name: str, value: object) -> None:
+        """Change `gain` (in contact stiffnesses, 0 to 1000) from the next step on.
+
+        Raises RcpParameterError for another name or a value out of range.
+        """
+        if name != "gain":
+            raise RcpParameterError(f"{name}: expected gain, nothing else can be changed")
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value <= 1000:
+            raise RcpParameterError(f"gain: found {value!r}, expected 0 to 1000")
+        self.parameters[GAIN] = np.repeat(np.array(normalised_gain(float(value))), PER_RING)

@@ -85,6 +85,7 @@ class ZmqPort:
             self._out.set(zmq.LINGER, linger_ms)
             self._in.set(zmq.RCVHWM, 0)
             self._in.set(zmq.LINGER, 0)
+            self._in.set(zmq.RECONNECT_IVL, 100)  # ms; an endpoint may be bound later
             self._in.set(zmq.MAXMSGSIZE, 4 * MAX_FRAME_BYTES)
             bind(self._out, endpoint)
             for topic in [BUNDLE.encode()] if bundled else sorted(self._topics):

@@ -1,6 +1,7 @@
 """The control channel between supervisor and processes: a few small, checked messages.
 
-A process says hello, ready, beat, fault, bye; the supervisor says go, finish, leave. Every message
+A process says hello, ready, beat, fault, bye; the supervisor says go, finish, leave. Clients (the
+command line, scripts) ask and are answered. Every message
 is a msgpack map {"kind": ..., ...}. Nothing that changes what a node computes travels here: that
 goes over `run.event`, where it is recorded.
 """
@@ -25,6 +26,8 @@ _FIELDS: dict[str, dict[str, type]] = {
     "finish": {"sent": dict, "cause": str, "died": str},
     "closed": {"received": dict, "cpu_s": float},
     "leave": {},
+    "ask": {"verb": str, "arguments": dict},
+    "answer": {"accepted": bool, "text": str, "data": dict},
 }
 _MAX_BYTES = 1 << 20
 

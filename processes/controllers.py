@@ -17,6 +17,7 @@ from vibrissa.control.controller import Controller
 from vibrissa.control.kinematics import paper_head
 from vibrissa.control.open_loop import OpenLoop
 from vibrissa.control.rcp import Rcp, RcpParams, normalised_gain
+from vibrissa.control.social import contralateral_protraction, mimc, spread_reduction
 from vibrissa.control.whisk_pattern import WhiskParams, full_whisk
 from vibrissa.messages.types import TICK_HZ
 from vibrissa.processes.config import Experiment, slew_limit
@@ -37,7 +38,13 @@ def _rcp(whisk: WhiskParams, gain: float = 3.0, window: float = 0.01) -> Control
     return Rcp(RcpParams(whisk, normalised_gain(gain), ticks))
 
 
-BUILT_IN: Final[dict[str, Maker]] = {"open_loop": _open_loop, "rcp": _rcp}
+BUILT_IN: Final[dict[str, Maker]] = {
+    "open_loop": _open_loop,
+    "rcp": _rcp,
+    "spread_reduction": spread_reduction,
+    "contralateral_protraction": contralateral_protraction,
+    "mimc": mimc,
+}
 
 
 def available(experiment: Experiment) -> dict[str, str]:

@@ -21,7 +21,7 @@ import zmq
 from vibrissa.messages.codec import CODECS
 from vibrissa.messages.errors import MessageError
 from vibrissa.messages.transport import ZmqPort
-from vibrissa.messages.types import TICK_NS, Event, Telemetry
+from vibrissa.messages.types import TICK_NS, Event, Order, Telemetry
 from vibrissa.processes import realtime
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.control import ControlLine
@@ -73,13 +73,13 @@ class Host:
     def __init__(self, name: str, layout: Layout) -> None:
         self.name = name
         self.layout = layout
-        self.nodes = layout.hosts[name]
+        self.nodes = layout.hosts.get(name, [name])
         rows = [ROWS[n] for n in self.nodes]
         self.pacing = rows[0].pacing
         experiment = Experiment.model_validate_json(layout.experiment)
         self.last_tick = experiment.ticks
         for row in rows:
-            rehearse(row.name, experiment)
+            rehearse(row.name, experiment, layout.controllers.get(row.name))
         self.missing = realtime.prepare(
             max(r.priority for r in rows) if experiment.run.realtime else 0,
             reflex=any(r.reflex for r in rows),
@@ -208,11 +208,16 @@ class Host:
                 seat.probe_went_out(step.t, end)
         elif topic == seat.answer:
             seat.probe_came_back(step.t, start)
-        elif topic == "run.event" and CODECS[topic].decode(frame).body.kind == "stop":
-            self.stopping = True
+        elif topic in ("run.event", "run.order"):
+            self._heed(CODECS[topic].decode(frame).body)
         seat.book.add(step)
         if len(seat.book) >= RECEIPT_BATCH:
             self._publish_own(seat.book.frame(step.t))
+
+    def _heed(self, body: Event | Order) -> None:
+        """A stop is for everybody, a close for the slot it names."""
+        if body.kind == "stop" or (body.kind == "close" and body.node in self.nodes):
+            self.stopping = True
 
     def _publish_own(self, frame: bytes) -> None:
         self.port.publish(frame)

@@ -9,10 +9,16 @@ from pathlib import Path
 
 from vibrissa.messages.topics import TOPICS
 from vibrissa.messages.transport import BUNDLE
-from vibrissa.processes.table import PUBLISHED_BY_HOSTS, ROWS
+from vibrissa.processes.table import PUBLISHED_BY_HOSTS, ROWS, SLOTS
 
-SUPERVISOR_SAYS = ("run.event",)
-SUPERVISOR_HEARS = ("node.event",)
+SUPERVISOR_SAYS = ("run.calibration", "run.event", "run.order")
+SUPERVISOR_HEARS = (
+    "head.owner",
+    "head.shadow",
+    "node.answer",
+    "node.event",
+    "whisk.calibration",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +35,8 @@ class Layout:
     """Path of the log the recorder writes."""
     metadata: dict[str, str]
     """What the log says about the run."""
+    controllers: dict[str, str] = field(default_factory=dict)
+    """slot -> the controller its process is to be warm for"""
 
     def write(self, path: Path) -> None:
         path.write_text(json.dumps(asdict(self)))
@@ -43,7 +51,7 @@ class Layout:
             return list(SUPERVISOR_SAYS)
         if process == "recorder":
             return []
-        nodes = self.hosts[process]
+        nodes = self.hosts.get(process, [process])
         return sorted({t for n in nodes for t in ROWS[n].says} | set(PUBLISHED_BY_HOSTS))
 
     def hears(self, process: str) -> list[str]:
@@ -52,16 +60,19 @@ class Layout:
             return list(SUPERVISOR_HEARS)
         if process == "recorder":
             return [t.name for t in TOPICS.values() if t.recorded]
-        nodes = self.hosts[process]
+        nodes = self.hosts.get(process, [process])
         wanted = {t for n in nodes for t in ROWS[n].hears}
         return sorted(t for t in wanted if self.speakers(t) - {process})
 
     def speakers(self, topic: str) -> set[str]:
         """Processes that publish a topic; a host's own events reach its nodes directly."""
-        everyone = ["supervisor", *self.hosts]
         if topic in PUBLISHED_BY_HOSTS:
             return set()
-        return {p for p in everyone if topic in self.says(p)}
+        return {p for p in self._publishers() if topic in self.says(p)}
+
+    def _publishers(self) -> list[str]:
+        """Everybody who may publish in this run, slots that are empty yet included."""
+        return list(dict.fromkeys(["supervisor", *self.hosts, *SLOTS]))
 
     def bundled(self, process: str) -> bool:
         """Whether a process takes what it hears in bundles: nothing in it reacts at once."""
@@ -73,10 +84,10 @@ class Layout:
     def connections(self, process: str) -> list[str]:
         """Endpoints a process must connect to for what it hears."""
         if process == "recorder":
-            names = ["supervisor", *self.hosts]
+            names = self._publishers()
         else:
             wanted = {p for t in self.hears(process) for p in self.speakers(t)} - {process}
-            names = [p for p in ["supervisor", *self.hosts] if p in wanted]
+            names = [p for p in self._publishers() if p in wanted]
         return [self.endpoints[name] for name in names]
 
     def audience(self, process: str) -> dict[str, int]:

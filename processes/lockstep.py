@@ -6,14 +6,15 @@ of each. Because it runs the same `Stepper` as every other executor, it gives th
 
 from __future__ import annotations
 
-import contextlib
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from types import TracebackType
+from typing import Self
 
 import msgpack
 import zmq
@@ -83,38 +84,52 @@ class RemoteRunner:
         return Step((topic, source, epoch), seq, t, outputs, digest)
 
 
-@contextlib.contextmanager
-def workers(
-    names: Iterable[str], experiment: Experiment, replacements: Replacements
-) -> Iterator[dict[str, RemoteRunner]]:
-    """A running worker for each node, ended on leaving."""
-    folder = Path(tempfile.mkdtemp(prefix="vibrissa-"))
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    runners: dict[str, RemoteRunner] = {}
-    processes = []
-    try:
-        (folder / "experiment.json").write_text(experiment.model_dump_json())
-        for name in names:
-            socket = context.socket(zmq.PAIR)
-            socket.set(zmq.SNDHWM, 0)
-            endpoint = f"ipc://{folder}/{name}"
-            socket.bind(endpoint)
-            command = [sys.executable, "-m", "vibrissa.processes.lockstep", name, str(folder)]
-            command += [replacements[name]] if name in replacements else []
-            environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-            process = subprocess.Popen(command, env=environment)
-            processes.append(process)
-            runners[name] = RemoteRunner(name, process, socket)
-        for runner in runners.values():
+class Workers:
+    """Worker processes for nodes, started one by one and ended together."""
+
+    def __init__(self, experiment: Experiment, replacements: Replacements) -> None:
+        self._replacements = replacements
+        self._folder = Path(tempfile.mkdtemp(prefix="vibrissa-"))
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._processes: list[subprocess.Popen[bytes]] = []
+        (self._folder / "experiment.json").write_text(experiment.model_dump_json())
+
+    def start(self, names: Iterable[str]) -> list[RemoteRunner]:
+        """A running, answering worker for each node."""
+        runners = [self._start(name) for name in names]
+        for runner in runners:
             runner.submit([b""])
             runner.collect()  # an empty frame asks "are you there?"
-        yield runners
-    finally:
-        for process in processes:
+        return runners
+
+    def _start(self, name: str) -> RemoteRunner:
+        socket = self._context.socket(zmq.PAIR)
+        socket.set(zmq.SNDHWM, 0)
+        socket.bind(f"ipc://{self._folder}/{name}")
+        command = [sys.executable, "-m", "vibrissa.processes.lockstep", name, str(self._folder)]
+        command += [self._replacements[name]] if name in self._replacements else []
+        environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+        process = subprocess.Popen(command, env=environment)
+        self._processes.append(process)
+        return RemoteRunner(name, process, socket)
+
+    def close(self) -> None:
+        for process in self._processes:
             process.kill()
             process.wait()
-        context.destroy(linger=0)
-        shutil.rmtree(folder, ignore_errors=True)
+        self._context.destroy(linger=0)
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
 
 
 def main() -> None:

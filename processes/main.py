@@ -5,8 +5,11 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import zmq
+
 from vibrissa.messages.errors import MessageError
 from vibrissa.messages.log_format import LogError
+from vibrissa.processes.control import ControlLine
 from vibrissa.processes.layout import Layout
 from vibrissa.processes.results import RunError
 
@@ -14,7 +17,8 @@ from vibrissa.processes.results import RunError
 def main() -> None:
     """Run the named process of the layout in the given run directory."""
     name, folder = sys.argv[1], Path(sys.argv[2])
-    layout = Layout.read(folder / "layout.json")
+    own = folder / f"layout-{name}.json"
+    layout = Layout.read(own if own.exists() else folder / "layout.json")
     try:
         if name == "recorder":
             from vibrissa.processes import recorder
@@ -25,8 +29,17 @@ def main() -> None:
 
             host.main(name, layout)
     except (MessageError, LogError, RunError) as error:
-        print(f"{name}: {error}", file=sys.stderr)
+        report_failure(layout.endpoints["control"], name, str(error))
         sys.exit(2)
+
+
+def report_failure(endpoint: str, name: str, cause: str) -> None:
+    """Tell the supervisor why this process can't run."""
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    line = ControlLine(context, endpoint, name)
+    line.say("fault", cause=cause[:400])
+    line.close()
+    context.term()
 
 
 if __name__ == "__main__":

@@ -20,7 +20,10 @@ Replacements = Mapping[str, str]
 def make_stepper(name: str, experiment: Experiment, replacements: Replacements) -> Stepper:
     """A fresh stepper of a node, the user's class where one is named. Raises UnusableLogError."""
     if name not in replacements:
-        return Stepper(name, build(name, experiment))
+        try:
+            return Stepper(name, build(name, experiment))
+        except ValueError as error:
+            raise UnusableLogError(f"{name} can't be made from the experiment: {error}") from None
     return Stepper(name, load_node(name, replacements[name], experiment))
 
 

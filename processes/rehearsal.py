@@ -17,21 +17,25 @@ from vibrissa.messages.codec import CODECS
 from vibrissa.messages.types import TICK_NS, WHISKERS
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.node import Node, Stepper
-from vibrissa.processes.table import ROWS, build
+from vibrissa.processes.table import ROWS, SLOTS, build
 
 TICKS = 1600
 PERIOD = 400
 ARM_TICKS = 16
 
 
-def rehearse(name: str, experiment: Experiment) -> None:
-    """Step a throw-away copy of a node through a short made-up run."""
+def rehearse(name: str, experiment: Experiment, controller: str | None = None) -> None:
+    """Step a throw-away copy of a node through a short made-up run.
+
+    A slot is rehearsed as the run's first whisk process with the controller it is meant for.
+    """
+    changes: dict[str, Any] = {"period": PERIOD / types.TICK_HZ, "calibration_cycles": 1}
+    if name in SLOTS:
+        name, changes["controller"] = "whisk", controller or experiment.whisk.controller
     short = experiment.model_copy(
         update={
             "run": experiment.run.model_copy(update={"duration": TICKS / types.TICK_HZ + 1}),
-            "whisk": experiment.whisk.model_copy(
-                update={"period": PERIOD / types.TICK_HZ, "calibration_cycles": 1}
-            ),
+            "whisk": experiment.whisk.model_copy(update=changes),
         }
     )
     rehearse_node(name, build(name, short))
@@ -58,6 +62,8 @@ def _made_up_run() -> Iterator[tuple[str, str, int, int, Any]]:
         yield "host.timer", "rig", tick, t, types.TimerTick(tick)
         yield "rig.sample", "rig", tick, t, types.HeadReading(tick, tick - 1, theta, x, y)
         sample = types.HeadSample(tick, tick - 1, theta, x, y, command)
+        if tick == 0:
+            yield "head.owner", "sampler", 0, t, types.Ownership(0, "whisk", 0)
         yield "head.sample", "sampler", tick, t, sample
         yield "whisk.command", "whisk", tick, t, types.WhiskCommand(tick, command)
         yield "head.command", "sampler", tick, t, types.HeadCommand(tick, "whisk", command)

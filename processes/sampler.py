@@ -6,11 +6,15 @@ from vibrissa.control.arbiter import NO_TICK, RETRACT, Arbiter, ControllerId, De
 from vibrissa.control.kinematics import paper_head
 from vibrissa.messages.codec import Message
 from vibrissa.messages.types import (
+    TICK_HZ,
+    Answer,
     Event,
     HeadCommand,
     HeadReading,
     HeadSample,
+    Order,
     Ownership,
+    ShadowStatus,
     WhiskCommand,
 )
 from vibrissa.processes.config import Experiment, slew_limit
@@ -29,20 +33,23 @@ class SamplerNode:
     Until the operator's start, from the last half second of the run on, and whenever a stop or a
     fault asks for it, the built-in retract controller has the drives. It also takes over from a
     controller that is late, until that controller has been on time for 0.1 s; one that sent what no
-    drive may get stays out.
+    drive may get stays out. Orders register newcomers in shadow and switch between controllers.
     """
 
     def __init__(self, experiment: Experiment) -> None:
         self._arbiter = Arbiter(paper_head().swing, slew_limit=slew_limit(experiment))
+        self._arbiter.register(CONTROLLER)
         self._retract_tick = experiment.retract_tick
         self._retracting = False
+        self._late_one: ControllerId | None = None
+        self._punctual = 0
+        self._last_punctual = 0
+        self._switching = 0
         self._ticks = 0
         self._answered = 0
         self._obeyed = 0
         self._late = 0
-        self._punctual = 0
-        self._last_punctual = 0
-        self._fell_back_late = False
+        self._switches = 0
 
     def step(self, message: Message) -> list[Output]:
         body = message.body
@@ -51,6 +58,8 @@ class SamplerNode:
                 return self._reading(body)
             case "whisk.command":
                 return self._command(message.source, message.epoch, body)
+            case "run.order" if body.node == "sampler":
+                return self._obey(body)
             case "run.event" if body.kind == "start":
                 return self._route(CONTROLLER)
             case "run.event" | "host.event" if body.kind in ("retract", "stop"):
@@ -59,12 +68,13 @@ class SamplerNode:
 
     def counters(self) -> dict[str, int]:
         """Ticks; those answered before the next sample came; those whose command the drives were
-        obeying when the next sample was taken; commands that came late."""
+        obeying when the next sample was taken; commands that came late; switches of controller."""
         return {
             "ticks": self._ticks,
             "answered": self._answered,
             "obeyed": self._obeyed,
             "late": self._late,
+            "switches": self._switches,
         }
 
     def _reading(self, reading: HeadReading) -> list[Output]:
@@ -83,38 +93,105 @@ class SamplerNode:
             command=self._arbiter.last_command,
         )
         outputs.append(("head.sample", sample))
-        return outputs + self._routed(tick, self._arbiter.on_sample(tick))
+        outputs += self._routed(tick, self._arbiter.on_sample(tick))
+        if (tick + 1) % TICK_HZ == 0:
+            outputs += self._shadows(tick)
+        return outputs
 
     def _command(self, source: str, epoch: int, command: WhiskCommand) -> list[Output]:
         controller = ControllerId(source, epoch)
-        outputs: list[Output] = []
-        if self._fell_back_late and controller == CONTROLLER:
-            outputs = self._recover(command.tick)
+        outputs = self._recover(command.tick) if controller == self._late_one else []
         routing = self._arbiter.on_command(controller, command.tick, command.command)
-        if routing.decision is not None and routing.decision.kind == "refused":
+        if routing.decisions and routing.decisions[0].kind == "refused":
             self._late += controller == self._arbiter.active and command.tick < self._arbiter.tick
             return outputs  # counted; one event per late command would flood the log
         return outputs + self._routed(command.tick, routing)
 
     def _recover(self, tick: int) -> list[Output]:
-        if tick != self._arbiter.tick:
+        """Count a late controller's punctual answers; enough of them give it the drives again."""
+        if tick != self._arbiter.tick or self._late_one is None:
             return []
         self._punctual = self._punctual + 1 if tick - self._last_punctual <= LONGEST_GAP else 1
         self._last_punctual = tick
-        return self._route(CONTROLLER) if self._punctual >= RECOVERY_TICKS else []
+        return self._route(self._late_one) if self._punctual >= RECOVERY_TICKS else []
 
     def _routed(self, tick: int, routing: Routing) -> list[Output]:
         outputs: list[Output] = []
-        if routing.decision is not None:
-            outputs.append(_event(routing.decision))
-            self._fell_back_late = routing.decision.cause.startswith("no command")
-            self._punctual = 0
-            outputs.append(_owner(tick, self._arbiter.active))
+        for decision in routing.decisions:
+            outputs += self._decided(decision)
         if routing.command is not None:
             name = self._arbiter.active.name
             self._answered += 1
             outputs.append(("head.command", HeadCommand(tick, name, routing.command)))
         return outputs
+
+    def _decided(self, decision: Decision) -> list[Output]:
+        """What follows from a decision the arbiter took by itself, at a sample or a command."""
+        outputs: list[Output] = [_event(decision)]
+        match decision.kind:
+            case "switched":
+                self._switches += 1
+                self._late_one = None
+                text = f"switched at tick {decision.tick}, {decision.cause}"
+                outputs.append(self._answer(self._switching, True, text))
+            case "refused" if self._switching:
+                outputs.append(self._answer(self._switching, False, decision.cause))
+                outputs.append(_owner(decision.tick, self._arbiter.active))
+                self._switching = 0
+            case "fallback":
+                late = decision.cause.startswith("no command")
+                self._late_one = decision.controller if late else None
+                self._punctual = 0
+                outputs.append(_owner(decision.tick, self._arbiter.active))
+        return outputs
+
+    def _obey(self, order: Order) -> list[Output]:
+        arbiter = self._arbiter
+        named = ControllerId(order.name)
+        at = None if order.at < 0 else order.at
+        match order.kind:
+            case "register":
+                decision = arbiter.register(named)
+            case "forget":
+                decision = arbiter.forget(named)
+            case "swap":
+                decision = arbiter.request(
+                    named, arbiter.tick, at=at, blend_ticks=order.blend_ticks
+                )
+            case "rollback":
+                decision = arbiter.rollback(arbiter.tick)
+            case _:
+                return [self._answer(order.request, False, f"can't {order.kind}")]
+        accepted = decision.kind != "refused"
+        outputs = [_event(decision), self._answer(order.request, accepted, decision.cause)]
+        if decision.kind == "armed" and arbiter.armed is not None:
+            self._switching = order.request
+            outputs.append(_owner(arbiter.armed.at, arbiter.armed.controller))
+        return outputs
+
+    def _shadows(self, tick: int) -> list[Output]:
+        """How every controller in shadow does, once a second."""
+        owners = self._arbiter.owners()
+        return [
+            (
+                "head.shadow",
+                ShadowStatus(
+                    tick=tick,
+                    controller=who.name,
+                    epoch=who.epoch,
+                    fresh=record.fresh_ticks,
+                    late=record.late,
+                    mean_divergence=float(record.divergence_mean),
+                    max_divergence=float(record.divergence_max),
+                ),
+            )
+            for who, record in owners.shadows.items()
+            if who != owners.active
+        ]
+
+    def _answer(self, request: int, accepted: bool, text: str) -> Output:
+        tick = max(self._arbiter.tick, NO_TICK)
+        return "node.answer", Answer(request, tick, int(accepted), "sampler", text[:400])
 
     def _start_retracting(self) -> list[Output]:
         if self._retracting:
@@ -123,7 +200,7 @@ class SamplerNode:
         return self._route(RETRACT)
 
     def _route(self, controller: ControllerId) -> list[Output]:
-        self._fell_back_late = False
+        self._late_one = None
         decision = self._arbiter.route(controller)
         return [_event(decision), _owner(max(decision.tick, NO_TICK) + 1, controller)]
 

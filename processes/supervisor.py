@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import collections
 import contextlib
+import dataclasses
 import json
 import os
 import shutil
@@ -29,13 +30,15 @@ import zmq
 from vibrissa.messages.codec import CODECS, decode
 from vibrissa.messages.errors import MessageError
 from vibrissa.messages.transport import ZmqPort
-from vibrissa.messages.types import TICK_HZ, TICK_NS, Event
+from vibrissa.messages.types import TICK_HZ, TICK_NS, Event, Order, WhiskCalibration
 from vibrissa.processes import provenance
 from vibrissa.processes.config import RETRACT_S, Experiment
 from vibrissa.processes.control import ControlDesk
 from vibrissa.processes.layout import Layout
+from vibrissa.processes.registry import listed
+from vibrissa.processes.requests import Requests, scheduled_slots
 from vibrissa.processes.results import OnProgress, Progress, RunError, silent
-from vibrissa.processes.table import PROCESSES, RECORDER_SILENCE, ROWS
+from vibrissa.processes.table import PROCESSES, RECORDER_SILENCE, ROWS, SLOTS
 
 LEAD_S: Final = 0.25
 """From the go to tick 0."""
@@ -64,6 +67,7 @@ class Child:
         self.t = 0
         self.steps = 0
         self.done = False
+        self.last_words = ""
         self.bye: dict[str, Any] | None = None
         self.closed: dict[str, Any] | None = None
 
@@ -86,10 +90,13 @@ class Supervisor:
         self.out = out
         self.on_progress = on_progress
         self.children: dict[str, Child] = {}
+        self.lost: dict[str, Child] = {}
         self.events: list[dict[str, Any]] = []
         self.sent: collections.Counter[str] = collections.Counter()
         self.cause: str | None = None
-        self._event_seq = 0
+        self.requests = Requests(self)
+        self._calibration: WhiskCalibration | None = None
+        self._seq: collections.Counter[str] = collections.Counter()
         self._interrupted = 0
         self.t0 = 0
         self._cpu0 = 0.0
@@ -98,11 +105,12 @@ class Supervisor:
     def run(self) -> dict[str, Any]:
         """The whole run. Raises RunError when it can't start; otherwise always gives a summary."""
         with self._folder() as folder, self._signals():
+            self.folder = folder
             self.layout = self._layout(folder)
             self.layout.write(folder / "layout.json")
             context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
             try:
-                self._serve(context, folder)
+                self._serve(context)
             finally:
                 self._kill_all()
                 context.destroy(linger=0)
@@ -110,7 +118,7 @@ class Supervisor:
         (self.out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
         return summary
 
-    def _serve(self, context: zmq.Context[zmq.Socket[bytes]], folder: Path) -> None:
+    def _serve(self, context: zmq.Context[zmq.Socket[bytes]]) -> None:
         self.desk = ControlDesk(context, self.layout.endpoints["control"])
         self.port = ZmqPort(
             context,
@@ -120,10 +128,13 @@ class Supervisor:
         )
         try:
             for name in [*self.layout.hosts, "recorder"]:
-                self._start(name, folder)
+                self._start(name)
+            for slot, controller in scheduled_slots(self.experiment).items():
+                self.start_slot(slot, controller)
             self._warm()
-            self._go()
-            self._watch()
+            with listed(self.out, self.layout.endpoints["control"]):
+                self._go()
+                self._watch()
             self._end()
         finally:
             self.port.close()
@@ -166,7 +177,7 @@ class Supervisor:
             hosts.setdefault(together.get(name, name), [])
         for host in hosts:
             hosts[host] = host.split("+")
-        names = ["control", "supervisor", "recorder", *hosts]
+        names = ["control", "supervisor", "recorder", *hosts, *SLOTS]
         if run.transport == "tcp":
             endpoints = {n: f"tcp://127.0.0.1:{run.tcp_port + i}" for i, n in enumerate(names)}
             for name, endpoint in endpoints.items():
@@ -174,20 +185,21 @@ class Supervisor:
         else:
             endpoints = {n: f"ipc://{folder}/{n}" for n in names}
         text = self.experiment.model_dump_json()
-        meta = provenance.metadata(text, "live")
+        nodes = [*PROCESSES, *scheduled_slots(self.experiment)]
+        meta = provenance.metadata(text, "live") | {"nodes": ",".join(nodes)}
         meta["run_id"] = f"{meta['config_hash'][:12]}-{time.time_ns():x}"
         return Layout(hosts, endpoints, text, str(self.out.absolute() / "run.mcap"), meta)
 
-    def _start(self, name: str, folder: Path) -> None:
+    def _start(self, name: str) -> None:
         environment = os.environ | {
             "OPENBLAS_NUM_THREADS": "1",
             "OMP_NUM_THREADS": "1",
             "NUMBA_NUM_THREADS": "1",
         }
-        command = [sys.executable, "-m", "vibrissa.processes.main", name, str(folder)]
+        command = [sys.executable, "-m", "vibrissa.processes.main", name, str(self.folder)]
         popen = subprocess.Popen(command, env=environment, start_new_session=True)
-        nodes = self.layout.hosts.get(name)
-        silence = min(ROWS[n].silence for n in nodes) if nodes is not None else RECORDER_SILENCE
+        nodes = self.layout.hosts.get(name, [name])
+        silence = RECORDER_SILENCE if name == "recorder" else min(ROWS[n].silence for n in nodes)
         self.children[name] = Child(name, popen, silence)
 
     def _warm(self) -> None:
@@ -205,9 +217,10 @@ class Supervisor:
                 return
             for child in self.children.values():
                 if child.popen.poll() is not None:
-                    raise RunError(f"{child.name} could not start (see above)")
-            if self.cause or self._interrupted:
-                raise RunError(self.cause or "interrupted before the run started")
+                    self._listen()  # its last words
+                    raise RunError(self.cause or f"{child.name} could not start (see above)")
+            if self._interrupted:
+                raise RunError("interrupted before the run started")
             if time.monotonic() > deadline:
                 late = ", ".join(n for n in self.children if n not in ready)
                 raise RunError(f"not ready after {WARM_S:g} s: {late}")
@@ -218,21 +231,30 @@ class Supervisor:
         self._cpu0 = time.process_time()
         for child in self.children.values():
             child.heard = time.monotonic()
+            if child.name in SLOTS:
+                child.silence = SLOTS[child.name].silence
             if child.name != "recorder":
                 self.desk.say(child.name, "go", t0_ns=self.t0)
         missing = sorted({m for c in self.children.values() for m in c.missing})
         if missing:
             self._note(0, "degraded", "supervisor", f"not granted: {', '.join(missing)}")
         self._decide("start", "operator started the run")
+        for swap in self.experiment.swap:
+            self.requests.schedule(swap)
 
     def _watch(self) -> None:
         """Until the run is complete or something ends it."""
         while self.cause is None:
             self._listen()
-            self._report("running", self._tick() / TICK_HZ)
+            self._report("running", self.tick / TICK_HZ)
             now = time.monotonic()
-            for child in self.children.values():
-                self.cause = self.cause or child.trouble(now)
+            self.requests.poll()
+            for child in list(self.children.values()):
+                trouble = child.trouble(now)
+                if trouble and child.name in SLOTS:
+                    self._lose(child, trouble)
+                else:
+                    self.cause = self.cause or trouble
             if self._interrupted:
                 self.cause = "interrupted by the operator"
             drivers = [c for c in self.children.values() if c.done]
@@ -256,7 +278,7 @@ class Supervisor:
         for child in hosts:
             if child.bye:
                 self.sent.update(child.bye["sent"])
-        died = ", ".join(c.name for c in hosts if not c.bye)
+        died = ", ".join([*(c.name for c in hosts if not c.bye), *self.lost])
         self.desk.say("recorder", "finish", sent=dict(self.sent), cause=str(self.cause), died=died)
         self._until(CLOSE_S, "closing the log", lambda: bool(recorder.closed) or _dead(recorder))
         for child in hosts:
@@ -264,11 +286,66 @@ class Supervisor:
         self._until(1.0, "leaving", lambda: all(_dead(c) for c in self.children.values()))
         self._wall = time.monotonic() - self._wall
 
+    @property
+    def tick(self) -> int:
+        """The present tick, from the common clock."""
+        if not self.t0:
+            return 0
+        tick = (time.monotonic_ns() - self.t0) // TICK_NS
+        return min(max(tick, 0), self.experiment.ticks)
+
+    def order(self, order: Order) -> None:
+        """Put an order on the bus."""
+        self._publish("run.order", order)
+
+    def start_slot(self, slot: str, controller: str) -> None:
+        """Start the process of a slot, warm for a controller; scheduled ones have been started."""
+        if slot in self.children:
+            return
+        layout = dataclasses.replace(
+            self.layout,
+            hosts=self.layout.hosts | {slot: [slot]},
+            controllers={slot: controller},
+        )
+        layout.write(self.folder / f"layout-{slot}.json")
+        self._start(slot)
+        self.children[slot].silence = WARM_S
+
+    def slot_ready(self, slot: str) -> bool:
+        """Whether a slot's process is warm and heard; it then joins the run. Raises RunError."""
+        child = self.children.get(slot)
+        if child is None:
+            raise RunError("its process ended before it was ready")
+        if not child.ready:
+            return False
+        if child.silence == WARM_S:
+            child.silence = SLOTS[slot].silence
+            self.desk.say(slot, "go", t0_ns=self.t0)
+        return True
+
+    def hand_over_calibration(self) -> bool:
+        """Repeat the calibration for newcomers; False when there is none yet."""
+        if self._calibration is None:
+            return False
+        self._publish("run.calibration", self._calibration)
+        return True
+
+    def _lose(self, child: Child, trouble: str) -> None:
+        """A slot is lost; the arbiter falls back if it had the drives, and the run goes on."""
+        why = child.last_words or trouble
+        self._note(self.tick, "lost", child.name, why)
+        if child.popen.poll() is None:
+            child.popen.kill()
+        child.popen.wait()
+        del self.children[child.name]
+        self.lost[child.name] = child
+        self.requests.lost(child.name)
+
     def _until(self, seconds: float, phase: str, done: Any) -> None:
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline and not done():
             self._listen()
-            self._report(phase, self._tick() / TICK_HZ)
+            self._report(phase, self.tick / TICK_HZ)
 
     def _listen(self) -> None:
         """Take everything that was said on the control channel and the bus."""
@@ -277,7 +354,7 @@ class Supervisor:
             try:
                 heard = self.desk.hear(wait)
             except MessageError as error:
-                self._note(self._tick(), "refused", "control", str(error))
+                self._note(self.tick, "refused", "control", str(error))
                 continue
             if heard is None:
                 break
@@ -287,17 +364,24 @@ class Supervisor:
             try:
                 message = decode(frame)
             except MessageError as error:
-                self._note(self._tick(), "refused", "supervisor", str(error))
+                self._note(self.tick, "refused", "supervisor", str(error))
                 continue
-            event: Event = message.body
-            self._note(event.tick, event.kind, event.node, event.cause)
-            if event.kind in FATAL:
-                self.cause = self.cause or f"{event.node}: {event.cause}"
+            self.requests.heard(message)
+            if message.topic == "whisk.calibration":
+                self._calibration = message.body
+            if message.topic == "node.event":
+                event: Event = message.body
+                self._note(event.tick, event.kind, event.node, event.cause)
+                if event.kind in FATAL:
+                    self.cause = self.cause or f"{event.node}: {event.cause}"
 
     def _take(self, name: str, message: dict[str, Any]) -> None:
+        if message["kind"] == "ask":
+            self._answer_client(name, message["verb"], message["arguments"])
+            return
         child = self.children.get(name)
         if child is None:
-            self._note(self._tick(), "refused", "control", f"a stranger calls itself {name[:40]!r}")
+            self._note(self.tick, "refused", "control", f"a stranger calls itself {name[:40]!r}")
             return
         child.heard = time.monotonic()
         match message["kind"]:
@@ -307,6 +391,8 @@ class Supervisor:
                 child.ready = True
             case "beat":
                 child.t, child.steps, child.done = message["t"], message["steps"], message["done"]
+            case "fault" if name in SLOTS:
+                child.last_words = message["cause"]
             case "fault":
                 self.cause = self.cause or f"{name}: {message['cause']}"
             case "bye":
@@ -314,26 +400,30 @@ class Supervisor:
             case "closed":
                 child.closed = message
 
+    def _answer_client(self, name: str, verb: str, arguments: dict[str, Any]) -> None:
+        def reply(accepted: bool, text: str, data: dict[str, Any]) -> None:
+            self._note(self.tick, verb if accepted else "refused", "client", text)
+            with contextlib.suppress(zmq.ZMQError):  # a client that is gone needs no answer
+                self.desk.say(name, "answer", accepted=accepted, text=text, data=data)
+
+        self.requests.ask(verb, arguments, reply)
+
     def _decide(self, kind: str, cause: str) -> None:
         """Put a decision on the bus, where every node takes it as an input and it is recorded."""
-        tick = max(self._tick(), 0)
-        event = Event(tick=tick, kind=kind, node="supervisor", cause=cause[:400])
-        frame = CODECS["run.event"].encode("supervisor", 0, self._event_seq, tick * TICK_NS, event)
-        self._event_seq += 1
-        self.port.publish(frame)
-        self.port.flush()
-        self.sent["run.event"] += 1
+        tick = self.tick
+        self._publish("run.event", Event(tick, kind, "supervisor", cause[:400]))
         self._note(tick, kind, "supervisor", cause)
+
+    def _publish(self, topic: str, body: Any) -> None:
+        seq = self._seq[topic]
+        self._seq[topic] += 1
+        self.port.publish(CODECS[topic].encode("supervisor", 0, seq, self.tick * TICK_NS, body))
+        self.port.flush()
+        self.sent[topic] += 1
 
     def _note(self, tick: int, kind: str, node: str, cause: str) -> None:
         if len(self.events) < 10_000:
             self.events.append({"tick": tick, "kind": kind, "node": node, "cause": cause})
-
-    def _tick(self) -> int:
-        if not self.t0:
-            return 0
-        tick = (time.monotonic_ns() - self.t0) // TICK_NS
-        return min(max(tick, 0), self.experiment.ticks)
 
     def _report(self, phase: str, done: float, note: str = "") -> None:
         self.on_progress(Progress(phase, done, self.experiment.run.duration, note))

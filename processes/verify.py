@@ -13,7 +13,7 @@ import contextlib
 import dataclasses
 import gc
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,10 +24,11 @@ from vibrissa.messages.errors import MessageError
 from vibrissa.messages.log_format import LogError, Record
 from vibrissa.messages.log_reader import LogReader
 from vibrissa.messages.topics import TOPICS
+from vibrissa.messages.types import Order
 from vibrissa.processes import provenance
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.framelog import frame_of
-from vibrissa.processes.lockstep import LocalRunner, RemoteRunner, workers
+from vibrissa.processes.lockstep import LocalRunner, RemoteRunner, Workers
 from vibrissa.processes.node import timer_frame
 from vibrissa.processes.rebuild import (
     Replacements,
@@ -46,7 +47,7 @@ from vibrissa.processes.results import (
     Verdict,
     silent,
 )
-from vibrissa.processes.table import PROCESSES, ROWS
+from vibrissa.processes.table import PROCESSES, ROWS, SLOTS
 
 PUMP_RECORDS: Final = 4000
 AFTERMATH_NS: Final = 500_000_000
@@ -231,8 +232,9 @@ def verify(
         )
     names = reader.metadata.get("nodes", ",".join(PROCESSES)).split(",")
     notes = provenance.mismatches(reader.metadata)
-    with _runners(executor, names, experiment, replacements) as runners, _no_collections():
-        return _verify(reader, experiment, executor, runners, notes, on_progress)
+    with _runners(executor, experiment, replacements) as start, _no_collections():
+        checks = Checks(start, names)
+        return _verify(reader, experiment, executor, checks, notes, on_progress)
 
 
 @contextlib.contextmanager
@@ -247,65 +249,67 @@ def _no_collections() -> Iterator[None]:
             gc.enable()
 
 
+Start = Callable[[Sequence[str]], Sequence[LocalRunner | RemoteRunner]]
+"""Makes runners for nodes."""
+
+
 @contextlib.contextmanager
 def _runners(
-    executor: Executor, names: Sequence[str], experiment: Experiment, replacements: Replacements
-) -> Iterator[Sequence[LocalRunner | RemoteRunner]]:
+    executor: Executor, experiment: Experiment, replacements: Replacements
+) -> Iterator[Start]:
     if executor == "lockstep":
-        with workers(names, experiment, replacements) as remote:
-            yield list(remote.values())
+        with Workers(experiment, replacements) as workers:
+            yield workers.start
     else:
-        yield [LocalRunner(make_stepper(n, experiment, replacements)) for n in names]
+        yield lambda names: [LocalRunner(make_stepper(n, experiment, replacements)) for n in names]
 
 
 def _verify(
     reader: LogReader,
     experiment: Experiment,
     executor: Executor,
-    runners: Sequence[LocalRunner | RemoteRunner],
+    checks: Checks,
     notes: list[str],
     on_progress: OnProgress,
 ) -> Verdict:
-    checks = {r.name: NodeCheck(r) for r in runners}
-    router = Router(checks)
     began = time.monotonic()
     t, stop_at = 0, None
     try:
         for count, record in enumerate(reader):
-            router.take(record)
+            checks.take(record)
             t = max(t, record.t)
             if count % PUMP_RECORDS == 0:
-                _pump(checks)
+                checks.pump()
                 on_progress(Progress(f"{executor} re-run", t * 1e-9, experiment.run.duration))
-                if stop_at is None and any(c.finding for c in checks.values()):
+                if stop_at is None and any(c.finding for c in checks.all):
                     stop_at = t + AFTERMATH_NS
                 if stop_at is not None and t > stop_at:
                     break
-        _pump(checks)
+        checks.pump()
     except LogError as error:
         raise UnusableLogError(str(error)) from None
     except MessageError as error:
         raise UnusableLogError(f"{reader.path}: a message can't be replayed: {error}") from None
     elapsed = time.monotonic() - began
-    first = first_cause([c.finding for c in checks.values() if c.finding is not None])
+    first = first_cause([c.finding for c in checks.all if c.finding is not None])
     cut = "recovered" in reader.extra or reader.complete is False
     died = reader.extra.get("died", {}).get("processes", "")
     if first is None:
-        lacking = [why for c in checks.values() if (why := c.leftovers())]
+        lacking = [why for c in checks.all if (why := c.leftovers())]
         if lacking and not (cut or died):
             raise UnusableLogError(f"{reader.path}: {lacking[0]}")
-        if not any(c.steps for c in checks.values()):
+        if not any(c.steps for c in checks.all):
             raise UnusableLogError(f"{reader.path}: it has no receipts, so nothing can be re-run")
         if cut or (died and lacking):
             why = f"{died} died during the run" if died else "the log is cut off"
-            ends = ", ".join(f"{c.name} {c.steps}" for c in checks.values())
+            ends = ", ".join(f"{c.name} {c.steps}" for c in checks.all)
             notes.append(f"{why}; verified to the last complete steps: {ends}")
     return Verdict(
         identical=first is None,
         executor=executor,
-        steps=sum(c.steps for c in checks.values()),
-        compared_bytes=sum(c.bytes for c in checks.values()),
-        compared_messages=sum(c.messages for c in checks.values()),
+        steps=sum(c.steps for c in checks.all),
+        compared_bytes=sum(c.bytes for c in checks.all),
+        compared_messages=sum(c.messages for c in checks.all),
         duration_s=t * 1e-9,
         realtime_factor=round(t * 1e-9 / max(elapsed, 1e-9), 2),
         first_difference=first,
@@ -320,26 +324,31 @@ def first_cause(findings: Sequence[Finding]) -> Difference | None:
     return min(roots, key=lambda f: f.t).difference if roots else None
 
 
-class Router:
-    """Hands every record to the checks of the nodes that said or heard it."""
+class Checks:
+    """The checks of all nodes; every record goes to those that said or heard it."""
 
-    def __init__(self, checks: dict[str, NodeCheck]) -> None:
-        self._checks = checks
-        self._hearers = {
-            topic: [check for name, check in checks.items() if topic in ROWS[name].hears]
-            for topic in TOPICS
-        }
+    def __init__(self, start: Start, names: Sequence[str]) -> None:
+        self._start = start
+        self._by_name: dict[str, NodeCheck] = {}
+        self._hearers: dict[str, list[NodeCheck]] = {topic: [] for topic in TOPICS}
+        self._add(names)
+
+    @property
+    def all(self) -> list[NodeCheck]:
+        return list(self._by_name.values())
 
     def take(self, record: Record) -> None:
         """Raises UnusableLogError for receipts and DecodeError for messages that can't be read."""
         topic, source, seq, _, _ = record
-        producer = self._checks.get(source)
+        producer = self._by_name.get(source)
         if topic == "node.receipt" and producer is not None:
             producer.add_receipts(frame_of(record))
         row = TOPICS.get(topic)
         if row is None or topic in ("node.receipt", "node.telemetry"):
             return
         frame = frame_of(record)
+        if topic == "run.order":
+            self._open_slot(frame)
         if producer is not None and row.compared:
             producer.add_output(topic, frame)
         hearers = self._hearers[topic]
@@ -349,9 +358,22 @@ class Router:
                 if topic != "host.event" or check is producer:
                     check.add_input(stream, seq, frame)
 
+    def pump(self) -> None:
+        """Let every node take all steps it can, and compare."""
+        for check in self._by_name.values():
+            check.submit()
+        for check in self._by_name.values():
+            check.collect()
 
-def _pump(checks: dict[str, NodeCheck]) -> None:
-    for check in checks.values():
-        check.submit()
-    for check in checks.values():
-        check.collect()
+    def _open_slot(self, frame: bytes) -> None:
+        """A controller was loaded into a slot: from here on the slot's node is re-run, too."""
+        order: Order = decode(frame).body
+        if order.kind == "open" and order.node in SLOTS and order.node not in self._by_name:
+            self._add([order.node])
+
+    def _add(self, names: Sequence[str]) -> None:
+        for runner in self._start(names):
+            check = self._by_name[runner.name] = NodeCheck(runner)
+            for topic in ROWS[runner.name].hears:
+                if topic in self._hearers:
+                    self._hearers[topic].append(check)

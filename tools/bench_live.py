@@ -36,10 +36,10 @@ def bench(out: Path, duration: float, on_progress: OnProgress) -> Bench:
     together = apart.model_copy(
         update={"run": apart.run.model_copy(update={"together": [["sampler", "whisk"]]})}
     )
-    found = floors.measure()
+    found = floors.measure(on_progress)
     live = measured_run(apart, next_directory("live", out), on_progress)
     joined = measured_run(together, next_directory("together", out), on_progress)
-    bare = floors.medians(found + floors.measure())
+    bare = floors.medians(found + floors.measure(on_progress))
 
     times = [{"run": "floor", "what": what, **figures} for what, figures in bare.items()]
     times += time_rows("live", live) + time_rows("together", joined)
@@ -84,12 +84,17 @@ def time_rows(run: str, summary: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def total_row(run: str, summary: dict[str, Any]) -> dict[str, Any]:
-    """What a run came to: ticks and the share of them answered, losses, receipts, processor use."""
-    ticks = summary["ticks"]
+    """What a run came to: ticks, losses, receipts, processor use.
+
+    A tick is answered when the command for its sample is there before the next sample, and obeyed
+    when the drives follow that command at the next sample already.
+    """
+    ticks, obeyed = summary["ticks"], summary["counters"]["sampler"]["obeyed"]
     return {
         "run": run,
         "ticks": ticks,
         "answered_percent": 100.0 * summary["ticks_answered"] / ticks if ticks else math.nan,
+        "obeyed_percent": 100.0 * obeyed / ticks if ticks else math.nan,
         "messages": sum(counts["sent"] for counts in summary["messages"].values()),
         "lost": sum(counts["lost"] for counts in summary["messages"].values()),
         "receipts_missing": summary["receipts_missing"],

@@ -92,6 +92,14 @@ def table(title: str, columns: tuple[str, ...], *, text_columns: int = 1) -> Tab
 
 
 @contextlib.contextmanager
+def busy(what: str) -> Iterator[None]:
+    """A sign of life on stderr for work of unknown length; nothing where stderr is no terminal."""
+    console = stderr()
+    with console.status(what) if console.is_terminal else contextlib.nullcontext():
+        yield
+
+
+@contextlib.contextmanager
 def progress_bar() -> Iterator[OnProgress]:
     """A bar on stderr for what takes long; nothing where stderr is no terminal."""
     from rich.progress import BarColumn, TextColumn
@@ -102,7 +110,7 @@ def progress_bar() -> Iterator[OnProgress]:
         yield lambda progress: None
         return
     bars = Bars(
-        TextColumn("{task.description:<10}"),
+        TextColumn("{task.description:<15}"),
         BarColumn(),
         TextColumn("{task.fields[time]}"),
         TextColumn("{task.fields[note]}", style="dim"),

@@ -11,7 +11,10 @@ import re
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, get_args
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 
 from vibrissa.messages.topics import TOPICS
 from vibrissa.processes.config import Experiment
@@ -62,11 +65,15 @@ def processes() -> str:
 
 def experiment() -> str:
     """Every key of an experiment file with its default."""
-    rows = []
-    for section, value in Experiment().__dict__.items():
-        for key, info in type(value).model_fields.items():
-            default = json.dumps(getattr(value, key))
-            rows.append((f"`{section}.{key}`", f"`{default}`", info.description or ""))
+    rows: list[tuple[str, ...]] = []
+    for name, info in Experiment.model_fields.items():
+        item = next(iter(get_args(info.annotation)), None)  # of a list of tables, [[name]]
+        if _is_table(info.annotation):
+            rows += _keys(f"{name}.", info.annotation)
+        elif _is_table(item):
+            rows += _keys(f"[[{name}]] ", item)
+        else:
+            rows.append(_key(name, info))
     return _markdown(("key", "default", "meaning"), rows)
 
 
@@ -84,9 +91,8 @@ def renewed(text: str) -> str:
 
 def outdated() -> list[Path]:
     """The documents that don't match the code."""
-    return [
-        path for path in sorted(DOCS.glob("*.md")) if renewed(path.read_text()) != path.read_text()
-    ]
+    texts = {path: path.read_text() for path in sorted(DOCS.glob("*.md"))}
+    return [path for path, text in texts.items() if renewed(text) != text]
 
 
 def main() -> None:
@@ -98,6 +104,19 @@ def main() -> None:
         else:
             print(f"{path}: does not match the code; 'make docs' rewrites it", file=sys.stderr)
     sys.exit(1 if wrong and "--write" not in sys.argv[1:] else 0)
+
+
+def _is_table(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, BaseModel)
+
+
+def _keys(prefix: str, section: Any) -> list[tuple[str, ...]]:
+    return [_key(prefix + name, info) for name, info in section.model_fields.items()]
+
+
+def _key(name: str, info: FieldInfo) -> tuple[str, ...]:
+    default = "required" if info.is_required() else f"`{json.dumps(info.default)}`"
+    return f"`{name}`", default, info.description or ""
 
 
 def _markdown(columns: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:

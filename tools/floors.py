@@ -20,7 +20,7 @@ import zmq
 
 from vibrissa.messages.types import TICK_HZ, TICK_NS
 from vibrissa.processes import realtime
-from vibrissa.processes.results import RunError
+from vibrissa.processes.results import OnProgress, Progress, RunError, silent
 from vibrissa.processes.stats import Histogram
 
 SET_UPS: Final = ("as it comes", "set up like the reflex loop")
@@ -34,12 +34,15 @@ Times = dict[str, float]
 """p50, p99, p999, max in us."""
 
 
-def measure() -> list[dict[str, Times]]:
+def measure(on_progress: OnProgress = silent) -> list[dict[str, Times]]:
     """Both floors in both set-ups, REPEATS times in turn; each {name: times}."""
     found = []
-    for _ in range(REPEATS):
+    each = 2 * SECONDS * len(SET_UPS)
+    for repeat in range(REPEATS):
         floors: dict[str, Times] = {}
-        for set_up in SET_UPS:
+        for count, set_up in enumerate(SET_UPS):
+            done = each * repeat + 2 * SECONDS * count
+            on_progress(Progress("floors", done, each * REPEATS, set_up))
             with tempfile.TemporaryDirectory(prefix="vibrissa-floor-") as folder:
                 echo = _start("echo", folder, set_up)
                 try:

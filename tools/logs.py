@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vibrissa.tools.console import Json, Log, fail, log_file, note, print_json, stdout, table
+from vibrissa.tools.console import Json, Log, busy, fail, log_file, note, print_json, stdout, table
 
 if TYPE_CHECKING:
     from vibrissa.messages.recover import LogSummary
@@ -23,7 +23,8 @@ def info(log: Log, as_json: Json = False) -> None:
     from vibrissa.messages.recover import summarise
 
     path = log_file(log)
-    summary = summarise(path)
+    with busy("reading the log"):
+        summary = summarise(path)
     fault = what_is_wrong(summary)
     if as_json:
         metadata = {key: _parsed(value) for key, value in summary.metadata.items()}
@@ -54,7 +55,8 @@ def recover(
 
     path = log_file(log)
     out = out or path.with_name(f"{path.stem}-recovered.mcap")
-    found = recover_log(path, out)
+    with busy("copying what can be read"):
+        found = recover_log(path, out)
     if as_json:
         print_json({"out": out, "lossless": found.lossless, **dataclasses.asdict(found)})
         return
@@ -78,7 +80,8 @@ def plot(
 
     path = log_file(log)
     out = out or path.with_suffix(".png")
-    draw(path).savefig(out, dpi=130)
+    with busy("drawing"):
+        draw(path).savefig(out, dpi=130)
     stdout().print(str(out), markup=False)
 
 

@@ -7,8 +7,7 @@ the contacts of all whiskers over time.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -18,84 +17,26 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from vibrissa.control.kinematics import RINGS, whisker_name
-from vibrissa.messages.codec import Message, decode
 from vibrissa.messages.log_reader import LogReader
 from vibrissa.messages.types import TICK_HZ, TICK_NS, WHISKERS
-from vibrissa.processes.framelog import frame_of
-from vibrissa.processes.rebuild import experiment_of, open_log
+from vibrissa.processes.rebuild import open_log
 from vibrissa.rig.maze import Maze, parse_maze
+from vibrissa.tools.story import BIN_TICKS, Story, messages, tell
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from vibrissa.messages.types import SlamMap, SlamPose, Telemetry, WhiskCalibration
-    from vibrissa.processes.config import Experiment
 
 Floats = npt.NDArray[np.float64]
 
-BIN_TICKS: Final = 40
-"""Contacts are drawn in bins of 20 ms."""
 CYCLES_SHOWN: Final = 3
 RING_COLOURS: Final = ("#c44e52", "#dd8452", "#4c72b0")
-
-
-@dataclass
-class Story:
-    """What a log tells, in the amounts a picture needs: samples are kept as contacts only."""
-
-    experiment: Experiment
-    truth: list[tuple[float, ...]] = field(default_factory=list)
-    odometry: list[tuple[float, ...]] = field(default_factory=list)
-    first: SlamPose | None = None
-    map: SlamMap | None = None
-    calibration: WhiskCalibration | None = None
-    calibrated_s: float = 0.0
-    contacts: dict[int, npt.NDArray[np.bool_]] = field(default_factory=dict)
-    answered: int = 0
-    samples: int = 0
-    telemetry: dict[str, list[Telemetry]] = field(default_factory=dict)
-
-    def take(self, message: Message) -> None:
-        """Add one message."""
-        body = message.body
-        match message.topic:
-            case "arm.state":
-                self.truth.append((message.t * 1e-9, *body.pose))
-            case "slam.pose":
-                if self.first is None:
-                    self.first = body
-                else:
-                    self.odometry.append(tuple(body.odometry))
-            case "slam.map":
-                self.map = body
-            case "whisk.calibration":
-                self.calibration, self.calibrated_s = body, message.t * 1e-9
-            case "node.telemetry":
-                self.telemetry.setdefault(message.source, []).append(body)
-            case "head.sample":
-                self.samples += 1
-                self.answered += body.answers == body.tick - 1
-                if self.calibration is not None:
-                    away = np.abs(body.y - self.calibration.mean_y)
-                    touching = away > self.calibration.threshold_y
-                    if touching.any():
-                        row = self.contacts.setdefault(
-                            body.tick // BIN_TICKS, np.zeros(WHISKERS, np.bool_)
-                        )
-                        row |= touching
-
-
-WANTED: Final = frozenset(
-    ("arm.state", "slam.pose", "slam.map", "whisk.calibration", "node.telemetry", "head.sample")
-)
 
 
 def draw(log: Path) -> Figure:
     """The picture of a log. Raises UnusableLogError for what is no log; a cut-off one will do."""
     reader = open_log(log, allow_cut=True)
-    story = Story(experiment_of(reader))
-    for message in messages(reader, WANTED):
-        story.take(message)
+    story = tell(reader)
     figure = Figure(figsize=(14, 8), layout="constrained")
     grid = figure.add_gridspec(4, 2, width_ratios=(1.1, 1))
     draw_maze(figure.add_subplot(grid[:3, 0]), story)
@@ -109,13 +50,6 @@ def draw(log: Path) -> Figure:
         f"{reader.metadata.get('mode', '')}"
     )
     return figure
-
-
-def messages(reader: LogReader, topics: frozenset[str]) -> Iterator[Message]:
-    """The decoded messages of some topics; damage ends a log here instead of raising."""
-    for record in reader.records(lambda damage: None):
-        if record.topic in topics:
-            yield decode(frame_of(record))
 
 
 def draw_maze(ax: Axes, story: Story) -> None:
@@ -240,8 +174,8 @@ def draw_contacts(ax: Axes, story: Story) -> None:
 
 def draw_timing(ax: Axes, story: Story) -> None:
     """Latency, lateness and work time of each process: median of its means per second, and max."""
-    share = story.answered / story.samples if story.samples else 0.0
-    ax.set_title(f"timing: {share:.2%} of {story.samples} ticks answered in time", loc="left")
+    share = story.obeyed / story.samples if story.samples else 0.0
+    ax.set_title(f"timing: drives obey the last sample's answer in {share:.1%}", loc="left")
     rows = [
         (f"{node} {kind}", float(np.median(mean[mean > 0])), float(worst.max()))
         for node, bodies in story.telemetry.items()

@@ -106,7 +106,10 @@ def print_summary(summary: dict[str, Any], out: Path) -> None:
 
     console = stdout()
     ticks, answered = summary["ticks"], summary["ticks_answered"]
-    share = f", {answered / ticks:.3%} answered within one period" if ticks else ""
+    share = f", {answered / ticks:.2%} answered within one period" if ticks else ""
+    obeyed = summary.get("counters", {}).get("sampler", {}).get("obeyed")
+    if ticks and obeyed is not None:
+        share += f", {obeyed / ticks:.2%} obeyed by the drives at the next sample"
     cause = Text(summary["cause"], style="green" if summary["ok"] else "red")
     console.print(cause + Text(f": {ticks} ticks{share}"))
 

@@ -119,7 +119,7 @@ def test_search_over_thousands_of_templates_of_equal_mean_is_exact():
         mine = LocalView(config)
         mine.on_image(query)
         number, cost, _ = oracle.match(mine.templates[0], templates, 0.005, 0, 1, False)
-        found = view._search(mine.templates[0], float(mine.templates[0].mean()))
+        found = view.nearest(mine.templates[0], float(mine.templates[0].mean()))
         assert (found[0], found[1]) == (number, cost / 18)
 
 

@@ -99,6 +99,7 @@ def test_live_targets_name_every_aim_and_judge_it() -> None:
             "receipts_missing": 0,
             "cpu_cores": 1.0,
             "latency_us": {"sampler": {"p50": p50}},
+            "counters": {"sampler": {"obeyed": answered - 9}},
         }
 
     live, joined = summary(300.0, 999), summary(20.0, 1000)

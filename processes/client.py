@@ -1,0 +1,93 @@
+"""A client of a live run, for scripts and notebooks; the command line uses it too.
+
+from vibrissa.processes.client import Client
+
+with Client() as run:
+    run.swap("open_loop", when="cycle")
+    run.rollback()
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import zmq
+
+from vibrissa.processes.control import ControlLine
+from vibrissa.processes.registry import control_endpoint
+from vibrissa.processes.results import RunError
+
+PATIENCE_S = 180.0
+"""Loading a controller may include compiling it."""
+
+
+class Client:
+    """Asks a live run to do something; methods raise RunError with the reason of a refusal."""
+
+    def __init__(self, run: Path | None = None) -> None:
+        """Connect to the run that writes to directory `run`, or to the only live one."""
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        name = f"client-{os.getpid()}-{id(self):x}"
+        try:
+            self._line = ControlLine(self._context, control_endpoint(run), name)
+        except Exception:
+            self._context.destroy(linger=0)
+            raise
+
+    def controllers(self) -> dict[str, Any]:
+        """What is installed and what is loaded, with the state and record of each."""
+        return self._ask("controllers")[1]
+
+    def swap(self, name: str, when: str = "now", blend: float = 0.0, **parameters: float) -> str:
+        """Give the drives to a controller, loading it first if need be.
+
+        when: "now" or "cycle" (at the start of the next whisk cycle); blend: s.
+        """
+        return self._ask(
+            "swap",
+            name=name,
+            when=when,
+            blend=blend,
+            parameters=json.dumps(parameters) if parameters else "",
+        )[0]
+
+    def rollback(self) -> str:
+        """Give the drives back to the previous controller."""
+        return self._ask("rollback")[0]
+
+    def unload(self, name: str) -> str:
+        """End a controller in shadow."""
+        return self._ask("unload", name=name)[0]
+
+    def set(self, node: str, key: str, value: float | bool | str) -> str:
+        """Change a parameter of a running node."""
+        return self._ask("set", node=node, key=key, value=json.dumps(value))[0]
+
+    def close(self) -> None:
+        """Let go of the run, which goes on."""
+        self._line.close()
+        self._context.destroy(linger=0)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _ask(self, verb: str, **arguments: Any) -> tuple[str, dict[str, Any]]:
+        self._line.say("ask", verb=verb, arguments=arguments)
+        answer = self._line.hear(PATIENCE_S)
+        if answer is None:
+            raise RunError(f"{verb}: the run did not answer within {PATIENCE_S:g} s")
+        if not answer["accepted"]:
+            raise RunError(answer["text"])
+        return answer["text"], answer["data"]

@@ -1,0 +1,281 @@
+"""What people and schedules ask of a run: load, swap, roll back, set, list.
+
+A request is a small program of several steps (start a process, hand over the calibration, register,
+wait until the newcomer answers on time, order the switch, wait for it). Each is a generator that
+yields while it waits; `poll` lets all of them go on. The live supervisor and the simulation run the
+same programs over the same orders, so a scheduled swap means the same in both.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Generator
+from typing import Any, Final, Protocol
+
+from vibrissa.messages.codec import Message
+from vibrissa.messages.types import TICK_HZ, Order
+from vibrissa.processes.config import Experiment, Swap
+from vibrissa.processes.controllers import available
+from vibrissa.processes.results import RunError
+from vibrissa.processes.table import PROCESSES, SLOTS
+
+NEXT_CYCLE: Final = "cycle"
+FRESH_PATIENCE_TICKS: Final = 2000
+"""How long a newcomer may take to answer 40 ticks in a row on time before a swap is refused."""
+RETRY_TICKS: Final = 200
+ANSWER_PATIENCE_TICKS: Final = 20_000
+NO_PARAMETERS: Final = {"rig", "sampler", "arm", "slam"}
+
+Program = Generator[None, None, str]
+"""Ends with one line for people; raises RunError with the reason of a refusal."""
+Reply = Callable[[bool, str, dict[str, Any]], None]
+
+
+class Run(Protocol):
+    """What a run, live or simulated, lets requests do."""
+
+    experiment: Experiment
+
+    @property
+    def tick(self) -> int:
+        """The present tick."""
+
+    def order(self, order: Order) -> None:
+        """Put an order on the bus."""
+
+    def start_slot(self, slot: str, controller: str) -> None:
+        """Start the process of a slot, warm for a controller."""
+
+    def slot_ready(self, slot: str) -> bool:
+        """Whether it answers. Raises RunError when it never will."""
+
+    def hand_over_calibration(self) -> bool:
+        """Repeat the calibration for newcomers; False when there is none yet."""
+
+
+def scheduled_slots(experiment: Experiment) -> dict[str, str]:
+    """slot -> controller for everything the experiment's schedule will load, in its order."""
+    wanted = dict.fromkeys(swap.to for swap in experiment.swap)
+    wanted.pop(experiment.whisk.controller, None)
+    return dict(zip(SLOTS, wanted, strict=False))
+
+
+class Requests:
+    """All requests of a run, and what they have loaded."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._programs: list[tuple[Program, Reply]] = []
+        self._answers: dict[int, list[tuple[bool, str]]] = {}
+        self._number = 0
+        self.slots: dict[str, str] = {"whisk": run.experiment.whisk.controller}
+        """slot -> controller, of everything that has the drives or is in shadow"""
+        self._used: list[str] = []
+        self.owner = "whisk"
+        self.shadows: dict[str, dict[str, Any]] = {}
+
+    def ask(self, verb: str, arguments: dict[str, Any], reply: Reply) -> None:
+        """Begin a request; `reply` is called once, at its end."""
+        programs: dict[str, Callable[..., Program]] = {
+            "controllers": self._list,
+            "swap": self._swap,
+            "rollback": self._rollback,
+            "unload": self._unload,
+            "set": self._set,
+        }
+        if verb not in programs:
+            reply(False, f"{verb[:40]!r}: expected one of {', '.join(programs)}", {})
+            return
+        try:
+            program = programs[verb](**arguments)
+        except TypeError as error:
+            reply(False, f"{verb}: {error}", {})
+            return
+        self._programs.append((program, reply))
+
+    def schedule(self, swap: Swap) -> None:
+        """Begin a swap of the experiment file; it is loaded at once and waits for its cycle."""
+        self._programs.append((self._scheduled(swap), lambda _accepted, _text, _data: None))
+
+    def poll(self) -> None:
+        """Let every request go on."""
+        for entry in list(self._programs):
+            program, reply = entry
+            try:
+                next(program)
+            except StopIteration as end:
+                self._programs.remove(entry)
+                reply(True, str(end.value), self.report())
+            except RunError as error:
+                self._programs.remove(entry)
+                reply(False, str(error), self.report())
+
+    def heard(self, message: Message) -> None:
+        """Take an answer, a change of ownership or a status from the bus."""
+        body = message.body
+        match message.topic:
+            case "node.answer":
+                self._answers.setdefault(body.request, []).append((bool(body.accepted), body.text))
+            case "head.owner":
+                self.owner = body.controller
+            case "head.shadow":
+                self.shadows[body.controller] = {
+                    "fresh_ticks": body.fresh,
+                    "late": body.late,
+                    "mean_divergence": round(body.mean_divergence, 5),
+                    "max_divergence": round(body.max_divergence, 5),
+                }
+
+    def lost(self, slot: str) -> None:
+        """The process of a slot is gone."""
+        self.slots.pop(slot, None)
+        self.shadows.pop(slot, None)
+
+    def report(self) -> dict[str, Any]:
+        """Installed controllers, and the loaded ones with how they do."""
+        loaded = [
+            {
+                "slot": slot,
+                "controller": controller,
+                "state": "active" if slot == self.owner else "shadow",
+                **self.shadows.get(slot, {}),
+            }
+            for slot, controller in self.slots.items()
+        ]
+        return {"installed": available(self._run.experiment), "loaded": loaded}
+
+    def _list(self) -> Program:
+        yield
+        return f"{len(self.slots)} loaded, {self.owner} has the drives"
+
+    def _swap(
+        self, name: str, when: str = "now", blend: float = 0.0, parameters: str = ""
+    ) -> Program:
+        if when not in ("now", NEXT_CYCLE):
+            raise RunError(f"swap: when is {when!r}, expected now or {NEXT_CYCLE}")
+        if not 0 <= blend <= 1:
+            raise RunError(f"swap: blend is {blend} s, expected 0 to 1")
+        slot = yield from self._loaded(name, parameters)
+        return (yield from self._switch(slot, -1, when == NEXT_CYCLE, blend))
+
+    def _scheduled(self, swap: Swap) -> Program:
+        period = self._run.experiment.period_ticks
+        slot = yield from self._loaded(swap.to, "")
+        at = swap.at_cycle * period
+        while self._run.tick < at - period:
+            yield
+        return (yield from self._switch(slot, at, False, swap.blend))
+
+    def _switch(self, slot: str, at: int, at_cycle: bool, blend: float) -> Program:
+        if at_cycle:
+            period = self._run.experiment.period_ticks
+            at = (self._run.tick // period + 1) * period
+            if at - self._run.tick < 10:  # too near for the order to arrive
+                at += period
+        ticks = round(blend * TICK_HZ)
+        deadline = self._run.tick + FRESH_PATIENCE_TICKS
+        while True:
+            number = self._order("swap", "sampler", slot, at=at, blend=ticks)
+            accepted, text = yield from self._answer(number)
+            if accepted:
+                break
+            if not text.startswith(("not ready", "stale")) or self._run.tick > deadline:
+                raise RunError(f"swap to {self.slots.get(slot, slot)} refused: {text}")
+            again = self._run.tick + RETRY_TICKS
+            while self._run.tick < again:
+                yield
+        accepted, text = yield from self._switched(number, at)
+        if not accepted:
+            raise RunError(f"swap to {self.slots.get(slot, slot)} refused: {text}")
+        return f"{self.slots.get(slot, slot)} ({slot}) {text}"
+
+    def _rollback(self) -> Program:
+        number = self._order("rollback", "sampler", "")
+        accepted, text = yield from self._answer(number)
+        if accepted:
+            accepted, text = yield from self._answer(number)
+        if not accepted:
+            raise RunError(f"rollback refused: {text}")
+        return text
+
+    def _unload(self, name: str) -> Program:
+        slots = [s for s, c in self.slots.items() if name in (s, c) and s != self.owner]
+        if not slots or slots[0] == "whisk":
+            raise RunError(f"unload: {name!r} is not a controller in shadow that was loaded")
+        accepted, text = yield from self._answer(self._order("forget", "sampler", slots[0]))
+        if not accepted:
+            raise RunError(f"unload refused: {text}")
+        self._order("close", slots[0], "")
+        self.lost(slots[0])
+        return f"{name} is unloaded"
+
+    def _set(self, node: str, key: str, value: str) -> Program:
+        named = [s for s, c in self.slots.items() if node in (s, c)]
+        if node in NO_PARAMETERS:
+            raise RunError(f"set: {node} has no parameters that can be changed while it runs")
+        if not named:
+            known = ", ".join([*PROCESSES, *self.slots.values()])
+            raise RunError(f"set: {node!r} is none of {known}")
+        try:
+            json.loads(value)
+        except ValueError:
+            raise RunError(f"set: {value!r} is no number, text in quotes, true or false") from None
+        accepted, text = yield from self._answer(self._order("set", named[0], key, value=value))
+        if not accepted:
+            raise RunError(f"set {node}.{key} refused: {text}")
+        return f"{node}: {text}"
+
+    def _loaded(self, name: str, parameters: str) -> Generator[None, None, str]:
+        """The slot in which a controller answers in shadow, loaded if it was not."""
+        if name not in available(self._run.experiment):
+            known = ", ".join(available(self._run.experiment))
+            raise RunError(f"unknown controller {name!r}, expected one of {known}")
+        for slot, controller in self.slots.items():
+            if controller == name and not parameters:
+                return slot
+        slot = self._free_slot()
+        self.slots[slot] = name
+        try:
+            self._order("open", slot, name)
+            self._run.start_slot(slot, name)
+            while not self._run.slot_ready(slot):
+                yield
+            while not self._run.hand_over_calibration():
+                yield
+            assigned = self._order("assign", slot, name, value=parameters)
+            for number in (assigned, self._order("register", "sampler", slot)):
+                accepted, text = yield from self._answer(number)
+                if not accepted:
+                    raise RunError(text)
+        except RunError as error:
+            self.lost(slot)
+            raise RunError(f"{name} could not be loaded: {error}") from None
+        return slot
+
+    def _free_slot(self) -> str:
+        used = set(self._used)
+        for slot in SLOTS:
+            if slot not in used:
+                self._used.append(slot)
+                return slot
+        raise RunError(f"no free slot: {len(SLOTS)} controllers were loaded in this run already")
+
+    def _switched(self, number: int, at: int) -> Generator[None, None, tuple[bool, str]]:
+        while self._run.tick < at:
+            yield
+        return (yield from self._answer(number))
+
+    def _order(
+        self, kind: str, node: str, name: str, *, value: str = "", at: int = -1, blend: int = 0
+    ) -> int:
+        self._number += 1
+        self._run.order(Order(self._number, kind, node, name, value, at, blend))
+        return self._number
+
+    def _answer(self, number: int) -> Generator[None, None, tuple[bool, str]]:
+        deadline = self._run.tick + ANSWER_PATIENCE_TICKS
+        while not self._answers.get(number):
+            if self._run.tick > deadline:
+                raise RunError("no answer: the node that was asked does not obey")
+            yield
+        return self._answers[number].pop(0)

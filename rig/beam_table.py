@@ -1,0 +1,133 @@
+"""The exact beam, precomputed: tables of the elastica and their interpolation.
+
+A table is float64[SIZE, SIZE, 4] over two coordinates from 0 to 1, read with cubic Lagrange
+interpolation. Two kinds:
+
+- peg: rows q, the diameter at the peg's distance over the base's, from LEAST_Q to 1; columns
+  s = 1 - sqrt(1 - (gamma / gamma_most)^2), with gamma_most(q) the impingement beyond which no
+  equilibrium exists and the shaft slides off. There the moment falls like a square root; in s it is
+  smooth. Entries: moment over the small-angle one; (arc length - 1) / gamma^2; angle of the shaft at
+  the contact over gamma; gamma_most. Valid for every shaft, since q is all that tells them apart.
+- tip on a plane, one for each tip over base diameter: rows height, the distance of the base from
+  the plane over the length, from LEAST_HEIGHT to 1; columns (first - turn) / first, with first the
+  angle to the plane's normal at which the straight shaft touches. Entries: moment over the
+  small-angle one; offset of the contact along the plane, and arc length to it, over their values at
+  first touch.
+
+Built with the project's own arithmetic only, so the bits are the same on every machine.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vibrissa.numerics import atan2, compiled
+from vibrissa.rig.elastica import PEG, last_peg, peg_under, shoot, solve, tip_contact
+
+SIZE = 33
+STEPS = 96  # of the shooting, a hundred times finer than the interpolation
+LEAST_Q = 0.1
+LEAST_HEIGHT = 0.05
+MOMENT, ARC, ANGLE, MOST = range(4)  # of the peg table
+OFFSET = 1  # of the tip tables, which have MOMENT, OFFSET and ARC_LENGTH
+ARC_LENGTH = 2
+
+
+@compiled
+def _peg_row(q: float, row: NDArray[np.float64], steps: int) -> None:
+    """Fill one row float64[SIZE, 4] of the peg table."""
+    size = row.shape[0]
+    most_force, most_arc, most = last_peg(q, steps)
+    force, arc = 0.0, 1.0
+    for n in range(size):
+        # gamma = 0 itself has no ratios; they hardly change up to a hundredth of the range.
+        left = 1.0 - n / (size - 1)
+        wanted = most * math.sqrt(1.0 - left * left) if n > 0 else 0.01 * most
+        if n == size - 1:
+            force, arc = most_force, most_arc
+        elif n < (3 * size) // 4:
+            guess = 3.0 * q * wanted if n < 2 else force
+            force, arc, _found = solve(PEG, 1.0 - q, guess, arc, 1.0, wanted, steps)
+        else:
+            low, high = force, most_force
+            for _ in range(40):
+                force = 0.5 * (low + high)
+                arc, gamma = peg_under(q, force, arc, steps)
+                if gamma < wanted:
+                    low = force
+                else:
+                    high = force
+        x, _y, theta = shoot(1.0 - q, arc, force, 0.0, steps)
+        row[n, MOMENT] = force * x / (3.0 * q * wanted)
+        row[n, ARC] = (arc - 1.0) / (wanted * wanted)
+        row[n, ANGLE] = theta / wanted
+        row[n, MOST] = most
+
+
+@compiled
+def _tip_row(r: float, height: float, row: NDArray[np.float64], steps: int) -> None:
+    """Fill one row float64[SIZE, 4] of a tip table."""
+    size = row.shape[0]
+    side = math.sqrt(1.0 - height * height)
+    first = atan2(side, height)
+    for n in range(size):
+        share = n / (size - 1) if n > 0 else 0.004
+        _force, arc, moment, offset, _found = tip_contact(r, height, first * (1.0 - share), steps)
+        row[n, MOMENT] = moment / (3.0 * r * first * share)
+        row[n, OFFSET] = offset / side
+        row[n, ARC_LENGTH] = arc
+    row[0, OFFSET], row[0, ARC_LENGTH] = 1.0, 1.0
+
+
+@lru_cache(maxsize=8)
+def peg_table(size: int = SIZE) -> NDArray[np.float64]:
+    """The peg table, float64[size, size, 4], read-only."""
+    table = np.empty((size, size, 4), dtype=np.float64)
+    for n in range(size):
+        _peg_row(LEAST_Q + (1.0 - LEAST_Q) * n / (size - 1), table[n], STEPS)
+    table.setflags(write=False)
+    return table
+
+
+@lru_cache(maxsize=64)
+def tip_table(r: float, size: int = SIZE) -> NDArray[np.float64]:
+    """The table of a tip on a plane, float64[size, size, 4], read-only; r: tip over base diameter."""
+    table = np.zeros((size, size, 4), dtype=np.float64)
+    for n in range(size):
+        # Heights crowd towards 1, where the shaft meets the plane head-on and buckles.
+        height = LEAST_HEIGHT + (1.0 - LEAST_HEIGHT) * n / (size - 1)
+        _tip_row(r, min(height, 1.0 - 1e-7), table[n], STEPS)
+    table.setflags(write=False)
+    return table
+
+
+@compiled
+def interpolate(
+    table: NDArray[np.float64], row: float, column: float
+) -> tuple[float, float, float, float]:
+    """The four entries at (row, column), each from 0 to 1 and clipped to that."""
+    size = table.shape[0]
+    y = min(max(row, 0.0), 1.0) * (size - 1)
+    x = min(max(column, 0.0), 1.0) * (size - 1)
+    i, j = min(max(int(y) - 1, 0), size - 4), min(max(int(x) - 1, 0), size - 4)
+    y0, x0 = y - i, x - j
+    y1, y2, y3 = y0 - 1.0, y0 - 2.0, y0 - 3.0
+    x1, x2, x3 = x0 - 1.0, x0 - 2.0, x0 - 3.0
+    a = (-y1 * y2 * y3 / 6.0, 0.5 * y0 * y2 * y3, -0.5 * y0 * y1 * y3, y0 * y1 * y2 / 6.0)
+    b0, b1 = -x1 * x2 * x3 / 6.0, 0.5 * x0 * x2 * x3
+    b2, b3 = -0.5 * x0 * x1 * x3, x0 * x1 * x2 / 6.0
+    p = q = r = s = 0.0
+    for k in range(4):
+        w = a[k]
+        w0, w1, w2, w3 = w * b0, w * b1, w * b2, w * b3
+        t0, t1 = table[i + k, j], table[i + k, j + 1]
+        t2, t3 = table[i + k, j + 2], table[i + k, j + 3]
+        p += (w0 * t0[0] + w1 * t1[0]) + (w2 * t2[0] + w3 * t3[0])
+        q += (w0 * t0[1] + w1 * t1[1]) + (w2 * t2[1] + w3 * t3[1])
+        r += (w0 * t0[2] + w1 * t1[2]) + (w2 * t2[2] + w3 * t3[2])
+        s += (w0 * t0[3] + w1 * t1[3]) + (w2 * t2[3] + w3 * t3[3])
+    return p, q, r, s
