@@ -82,7 +82,7 @@ class Host:
             rehearse(row.name, experiment, layout.controllers.get(row.name))
         self.missing = realtime.prepare(
             max(r.priority for r in rows) if experiment.run.realtime else 0,
-            reflex=any(r.reflex for r in rows),
+            rows[0].cores,
         )
         self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self.control = ControlLine(self.context, layout.endpoints["control"], name)

@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import NamedTuple, Self
 
 import msgpack
 import zmq
@@ -29,6 +29,27 @@ from vibrissa.processes.results import RunError
 ANSWER_S = 120
 
 
+class Result(NamedTuple):
+    """What came of one step of a batch; `error` says why the node could not take it, if so."""
+
+    digest: int
+    outputs: Sequence[bytes]
+    error: str = ""
+
+
+def run(stepper: Stepper, frames: Iterable[bytes]) -> list[Result]:
+    """The results of a batch, which ends with the first step that fails."""
+    results = []
+    for frame in frames:
+        try:
+            step = stepper.step(frame)
+        except Exception as error:
+            results.append(Result(stepper.digest, (), f"{type(error).__name__}: {error}"))
+            break
+        results.append(Result(step.digest, step.outputs))
+    return results
+
+
 class LocalRunner:
     """Steps a node in this process."""
 
@@ -41,12 +62,11 @@ class LocalRunner:
         """Hand over a batch."""
         self._frames = frames
 
-    def collect(self) -> list[tuple[int, Sequence[bytes]]]:
-        """(digest, outputs) of every step of the batch."""
-        step = self._stepper.step
-        results = [step(frame) for frame in self._frames]
+    def collect(self) -> list[Result]:
+        """What came of the batch."""
+        results = run(self._stepper, self._frames)
         self._frames = ()
-        return [(r.digest, r.outputs) for r in results]
+        return results
 
 
 class RemoteRunner:
@@ -63,7 +83,7 @@ class RemoteRunner:
         if frames:
             self._socket.send(msgpack.packb(list(frames)))
 
-    def collect(self) -> list[tuple[int, Sequence[bytes]]]:
+    def collect(self) -> list[Result]:
         if not self._asked:
             return []
         for _ in range(ANSWER_S * 10):
@@ -71,7 +91,7 @@ class RemoteRunner:
                 answer = msgpack.unpackb(self._socket.recv())
                 if isinstance(answer, str):
                     raise RunError(f"{self.name}: {answer}")
-                return [(digest, outputs) for digest, outputs in answer]
+                return [Result(*result) for result in answer]
             if self._process.poll() is not None:
                 break
         raise RunError(f"{self.name}: its worker process gave no answer")
@@ -80,7 +100,9 @@ class RemoteRunner:
         """One step at a time, for a `Group` whose members are elsewhere."""
         topic, source, epoch, seq, t = header(frame)
         self.submit([frame])
-        ((digest, outputs),) = self.collect()
+        ((digest, outputs, error),) = self.collect()
+        if error:
+            raise RunError(f"{self.name}: {error}")
         return Step((topic, source, epoch), seq, t, outputs, digest)
 
 
@@ -153,12 +175,7 @@ def main() -> None:
         return
     while True:
         frames = msgpack.unpackb(socket.recv())
-        answers: list[tuple[int, Sequence[bytes]]] = []
-        for frame in frames:
-            if frame:
-                step = stepper.step(frame)
-                answers.append((step.digest, step.outputs))
-        socket.send(msgpack.packb(answers))
+        socket.send(msgpack.packb(run(stepper, filter(None, frames))))
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
 from vibrissa.messages.topics import TOPICS
+from vibrissa.processes.realtime import Cores
 
 if TYPE_CHECKING:
     from vibrissa.processes.config import Experiment
@@ -21,8 +22,7 @@ Pacing = Literal["timer", "arrival", "drain"]
 class Process:
     """One row: a node, what it hears, what it says, and how it is hosted.
 
-    priority is SCHED_FIFO's, 0 for the ordinary scheduler; `reflex` processes have a core of their
-    own. `source` marks a stand-in for hardware:
+    priority is SCHED_FIFO's, 0 for the ordinary scheduler. `source` marks a stand-in for hardware:
     what-if re-runs take its messages from the log instead of stepping it. `silence` is how many
     seconds without a sign of life end the run. The first topic it hears drives it; from the end of
     that step to the arrival of the topic `answer` with the same t is its reaction latency.
@@ -34,7 +34,7 @@ class Process:
     says: tuple[str, ...]
     pacing: Pacing
     priority: int
-    reflex: bool = False
+    cores: Cores = "others"
     silence: float = 2.0
     source: bool = False
     answer: str = ""
@@ -66,7 +66,7 @@ PROCESSES: Final[dict[str, Process]] = {
             ),
             pacing="arrival",
             priority=48,
-            reflex=True,
+            cores="reflex",
             answer="whisk.command",
         ),
         Process(
@@ -82,7 +82,7 @@ PROCESSES: Final[dict[str, Process]] = {
             ),
             pacing="arrival",
             priority=46,
-            reflex=True,
+            cores="reflex",
         ),
         Process(
             "arm",
@@ -105,7 +105,7 @@ PROCESSES: Final[dict[str, Process]] = {
 }
 
 SLOTS: Final[dict[str, Process]] = {
-    name: dataclasses.replace(PROCESSES["whisk"], name=name, priority=44)
+    name: dataclasses.replace(PROCESSES["whisk"], name=name, priority=44, cores="any")
     for name in (f"whisk.{number}" for number in range(1, 8))
 }
 """Empty places for controllers that are loaded while a run goes on: whisk processes that give way

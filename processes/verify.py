@@ -28,7 +28,7 @@ from vibrissa.messages.types import Order
 from vibrissa.processes import provenance
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.framelog import frame_of
-from vibrissa.processes.lockstep import LocalRunner, RemoteRunner, Workers
+from vibrissa.processes.lockstep import LocalRunner, RemoteRunner, Result, Workers
 from vibrissa.processes.node import timer_frame
 from vibrissa.processes.rebuild import (
     Replacements,
@@ -78,6 +78,7 @@ class NodeCheck:
         self._batch: list[Entry] = []
         self._frames: list[bytes] = []
         self._next_step = 0
+        self._decided = -1
         self.steps = 0
         self.messages = 0
         self.bytes = 0
@@ -118,6 +119,8 @@ class NodeCheck:
                 if found is None:
                     break
                 frame = found
+            if topic == "run.event":
+                self._decided = entry.seq
             self._batch.append(self._entries.popleft())
             self._frames.append(frame)
         self._runner.submit(self._frames)
@@ -125,15 +128,15 @@ class NodeCheck:
     def collect(self) -> None:
         """Compare what came out with what was recorded."""
         results = self._runner.collect()
-        for entry, frame, (digest, outputs) in zip(self._batch, self._frames, results, strict=True):
-            self.finding = self._compare(entry, frame, digest, outputs)
+        for entry, frame, result in zip(self._batch, self._frames, results, strict=True):
+            self.finding = self._compare(entry, frame, result)
             if self.finding is not None:
                 break
             self.steps += 1
         self._batch.clear()
         self._frames = []
 
-    def leftovers(self) -> str | None:
+    def leftovers(self, last_decision: int) -> str | None:
         """What a complete log should not leave: a receipt without its message, or the reverse."""
         if self.finding is not None:
             return None
@@ -148,11 +151,17 @@ class NodeCheck:
             if frames:
                 seq = header(frames[0])[3]
                 return f"{self.name}: no receipt accounts for its {topic} #{seq}"
+        if self.name in PROCESSES and self._decided < last_decision:
+            return (
+                f"{self.name}: its receipts end at step {self._next_step}, before it consumed "
+                f"run.event #{last_decision}"
+            )
         return None
 
-    def _compare(
-        self, entry: Entry, frame: bytes, digest: int, outputs: Sequence[bytes]
-    ) -> Finding | None:
+    def _compare(self, entry: Entry, frame: bytes, result: Result) -> Finding | None:
+        digest, outputs, error = result
+        if error:
+            return self._broken(entry, frame, "step", f"digest {entry.digest:08x}", error)
         for output in outputs:
             topic = output[: output.find(b"\0")].decode()
             if not TOPICS[topic].recorded:
@@ -168,18 +177,16 @@ class NodeCheck:
             self.messages += 1
             self.bytes += len(output)
         if digest != entry.digest:
-            t = header(frame)[4]
-            difference = Difference(
-                self.name,
-                entry.step,
-                entry.stream[0],
-                "receipt",
-                f"digest {entry.digest:08x}",
-                f"digest {digest:08x} (the order of receipts or an input was altered)",
-                t * 1e-9,
-            )
-            return Finding(difference, t, None, (entry.stream, entry.seq))
+            now = f"digest {digest:08x} (the order of receipts or an input was altered)"
+            return self._broken(entry, frame, "receipt", f"digest {entry.digest:08x}", now)
         return None
+
+    def _broken(self, entry: Entry, frame: bytes, field: str, then: str, now: str) -> Finding:
+        """A step that went otherwise than its receipt says, whatever was said in it."""
+        t = header(frame)[4]
+        topic = entry.stream[0]
+        difference = Difference(self.name, entry.step, topic, field, then, now, t * 1e-9)
+        return Finding(difference, t, None, (entry.stream, entry.seq))
 
 
 def differing_field(recorded: bytes | None, recomputed: bytes) -> tuple[str, str, str]:
@@ -295,7 +302,7 @@ def _verify(
     cut = "recovered" in reader.extra or reader.complete is False
     died = reader.extra.get("died", {}).get("processes", "")
     if first is None:
-        lacking = [why for c in checks.all if (why := c.leftovers())]
+        lacking = [why for c in checks.all if (why := c.leftovers(checks.last_decision))]
         if lacking and not (cut or died):
             raise UnusableLogError(f"{reader.path}: {lacking[0]}")
         if not any(c.steps for c in checks.all):
@@ -331,6 +338,8 @@ class Checks:
         self._start = start
         self._by_name: dict[str, NodeCheck] = {}
         self._hearers: dict[str, list[NodeCheck]] = {topic: [] for topic in TOPICS}
+        self.last_decision = -1
+        """Number of the last run.event: a log that was closed shows that every node took it."""
         self._add(names)
 
     @property
@@ -349,6 +358,8 @@ class Checks:
         frame = frame_of(record)
         if topic == "run.order":
             self._open_slot(frame)
+        elif topic == "run.event":
+            self.last_decision = seq
         if producer is not None and row.compared:
             producer.add_output(topic, frame)
         hearers = self._hearers[topic]

@@ -26,61 +26,70 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.numerics import atan2, compiled
-from vibrissa.rig.elastica import PEG, last_peg, peg_under, shoot, solve, tip_contact
+from vibrissa.rig.elastica import (
+    PEG,
+    TIP,
+    follow_tip,
+    last_peg,
+    peg_between,
+    shoot,
+    solve,
+    tip_result,
+)
 
 SIZE = 33
 STEPS = 96  # of the shooting, a hundred times finer than the interpolation
 LEAST_Q = 0.1
 LEAST_HEIGHT = 0.05
 MOMENT, ARC, ANGLE, MOST = range(4)  # of the peg table
-OFFSET = 1  # of the tip tables, which have MOMENT, OFFSET and ARC_LENGTH
-ARC_LENGTH = 2
+BEARING, ARC_LENGTH = 1, 2  # of a tip table, besides MOMENT
 
 
 @compiled
 def _peg_row(q: float, row: NDArray[np.float64], steps: int) -> None:
     """Fill one row float64[SIZE, 4] of the peg table."""
     size = row.shape[0]
-    most_force, most_arc, most = last_peg(q, steps)
+    last = last_peg(q, steps)
+    most_excess, most_force, most = last
     force, arc = 0.0, 1.0
     for n in range(size):
         # gamma = 0 itself has no ratios; they hardly change up to a hundredth of the range.
         left = 1.0 - n / (size - 1)
         wanted = most * math.sqrt(1.0 - left * left) if n > 0 else 0.01 * most
         if n == size - 1:
-            force, arc = most_force, most_arc
-        elif n < (3 * size) // 4:
+            force, arc = most_force, 1.0 + most_excess * most_excess
+        elif 2 * n < size:
             guess = 3.0 * q * wanted if n < 2 else force
             force, arc, _found = solve(PEG, 1.0 - q, guess, arc, 1.0, wanted, steps)
         else:
-            low, high = force, most_force
-            for _ in range(40):
-                force = 0.5 * (low + high)
-                arc, gamma = peg_under(q, force, arc, steps)
-                if gamma < wanted:
-                    low = force
-                else:
-                    high = force
+            low = math.sqrt(arc - 1.0)
+            excess, force = peg_between(q, wanted, low, force, last, steps)
+            arc = 1.0 + excess * excess
         x, _y, theta = shoot(1.0 - q, arc, force, 0.0, steps)
         row[n, MOMENT] = force * x / (3.0 * q * wanted)
         row[n, ARC] = (arc - 1.0) / (wanted * wanted)
         row[n, ANGLE] = theta / wanted
         row[n, MOST] = most
+    row[0, MOMENT] = 1.0
 
 
 @compiled
 def _tip_row(r: float, height: float, row: NDArray[np.float64], steps: int) -> None:
     """Fill one row float64[SIZE, 4] of a tip table."""
     size = row.shape[0]
-    side = math.sqrt(1.0 - height * height)
-    first = atan2(side, height)
+    first = atan2(math.sqrt(1.0 - height * height), height)
+    kind, force, rest, turned = TIP, 0.0, first - 0.5 * math.pi, 0.0
     for n in range(size):
-        share = n / (size - 1) if n > 0 else 0.004
-        _force, arc, moment, offset, _found = tip_contact(r, height, first * (1.0 - share), steps)
-        row[n, MOMENT] = moment / (3.0 * r * first * share)
-        row[n, OFFSET] = offset / side
+        to = first * (n / (size - 1) if n > 0 else 1e-3)
+        kind, force, rest, _found = follow_tip(
+            r, height, first, turned, to, kind, force, rest, steps
+        )
+        turned = to
+        moment, offset, arc = tip_result(r, kind, force, rest, steps)
+        row[n, MOMENT] = moment * height / (3.0 * r * to)
+        row[n, BEARING] = atan2(offset, height)
         row[n, ARC_LENGTH] = arc
-    row[0, OFFSET], row[0, ARC_LENGTH] = 1.0, 1.0
+    row[0, MOMENT], row[0, BEARING], row[0, ARC_LENGTH] = height, first, 1.0
 
 
 @lru_cache(maxsize=8)
@@ -98,7 +107,6 @@ def tip_table(r: float, size: int = SIZE) -> NDArray[np.float64]:
     """The table of a tip on a plane, float64[size, size, 4], read-only; r: tip over base diameter."""
     table = np.zeros((size, size, 4), dtype=np.float64)
     for n in range(size):
-        # Heights crowd towards 1, where the shaft meets the plane head-on and buckles.
         height = LEAST_HEIGHT + (1.0 - LEAST_HEIGHT) * n / (size - 1)
         _tip_row(r, min(height, 1.0 - 1e-7), table[n], STEPS)
     table.setflags(write=False)

@@ -121,53 +121,90 @@ def solve(
 
 
 @compiled
-def peg_under(q: float, force: float, arc: float, steps: int) -> tuple[float, float]:
-    """Arc length to a peg at distance 1 that pushes with ``force``, and the angle gamma it causes.
+def peg_past(q: float, excess: float, force: float, steps: int) -> tuple[float, float]:
+    """(force, gamma) for which the contact lies 1 + excess^2 along the shaft, a peg at distance 1.
 
-    q: diameter at the distance of the peg over that of the base; arc: a guess.
+    q: diameter at the distance of the peg over that of the base; excess > 0; force: a guess.
     """
+    arc = 1.0 + excess * excess
     for _ in range(60):
         x, y, _theta = shoot(1.0 - q, arc, force, 0.0, steps)
         distance = math.sqrt(x * x + y * y)
-        x, y, _theta = shoot(1.0 - q, arc + 1e-7, force, 0.0, steps)
-        slope = (math.sqrt(x * x + y * y) - distance) * 1e7
-        step = min(max((1.0 - distance) / slope, -0.05), 0.05)
-        arc += step
-        if abs(step) < 1e-13:
+        nudge = 1e-7 * force
+        x, y, _theta = shoot(1.0 - q, arc, force + nudge, 0.0, steps)
+        slope = (math.sqrt(x * x + y * y) - distance) / nudge
+        step = min(max((1.0 - distance) / slope, -0.3 * force), 0.3 * force)
+        force += step
+        if abs(step) < 1e-13 * force:
             break
     x, y, theta = shoot(1.0 - q, arc, force, 0.0, steps)
-    return arc, theta - atan2(y, x)
+    return force, theta - atan2(y, x)
 
 
 @compiled
 def last_peg(q: float, steps: int) -> tuple[float, float, float]:
-    """(force, arc length, gamma) of the largest gamma at which a shaft rests against a peg.
+    """(excess, force, gamma) of the largest gamma at which a shaft rests against a peg.
 
-    Beyond, no force keeps it there: it slides past the peg. By golden section over the force.
+    Beyond, it slides past the peg, whatever the force. By golden section over the excess.
     """
-    step = 0.15 * q
-    before, before_arc, force, arc, gamma = 0.0, 1.0, 0.0, 1.0, 0.0
+    step = 0.01 + 0.03 * q
+    excess, gamma = step, 0.0
+    force, gamma = peg_past(q, excess, 3.0 * q * excess * math.sqrt(10.0 * q), steps)
+    before, before_force = excess, force
     while True:
-        next_arc, next_gamma = peg_under(q, force + step, arc, steps)
+        next_force, next_gamma = peg_past(q, excess + step, force, steps)
         if next_gamma < gamma:
             break
-        before, before_arc = force, arc
-        force, arc, gamma = force + step, next_arc, next_gamma
-    low, high = before, force + step
+        before, before_force = excess, force
+        excess, force, gamma = excess + step, next_force, next_gamma
+    low, high = before, excess + step
     ratio = 0.5 * (math.sqrt(5.0) - 1.0)
     a, b = high - ratio * (high - low), low + ratio * (high - low)
-    arc_a, gamma_a = peg_under(q, a, before_arc, steps)
-    arc_b, gamma_b = peg_under(q, b, before_arc, steps)
+    force_a, gamma_a = peg_past(q, a, before_force, steps)
+    force_b, gamma_b = peg_past(q, b, force_a, steps)
     for _ in range(32):
         if gamma_a > gamma_b:
-            high, b, arc_b, gamma_b = b, a, arc_a, gamma_a
+            high, b, force_b, gamma_b = b, a, force_a, gamma_a
             a = high - ratio * (high - low)
-            arc_a, gamma_a = peg_under(q, a, before_arc, steps)
+            force_a, gamma_a = peg_past(q, a, force_b, steps)
         else:
-            low, a, arc_a, gamma_a = a, b, arc_b, gamma_b
+            low, a, force_a, gamma_a = a, b, force_b, gamma_b
             b = low + ratio * (high - low)
-            arc_b, gamma_b = peg_under(q, b, before_arc, steps)
-    return b, arc_b, gamma_b
+            force_b, gamma_b = peg_past(q, b, force_a, steps)
+    return b, force_b, gamma_b
+
+
+@compiled
+def peg_between(
+    q: float, gamma: float, low: float, force: float, most: tuple[float, float, float], steps: int
+) -> tuple[float, float]:
+    """(excess, force) for an angle gamma between that of the excess ``low`` and the largest.
+
+    force: a guess at ``low``; most: as from `last_peg`. By the Illinois method over
+    sqrt(1 - (gamma / most)^2), which is nearly linear in the excess.
+    """
+    high, _force, largest = most
+    goal = math.sqrt(max(1.0 - (gamma / largest) * (gamma / largest), 0.0))
+    force, found = peg_past(q, low, force, steps)
+    at_low = math.sqrt(max(1.0 - (found / largest) * (found / largest), 0.0)) - goal
+    at_high, side, excess = -goal, 0, low
+    for _ in range(60):
+        if not (at_low > 0.0 > at_high and high - low > 1e-15):
+            break
+        excess = (low * at_high - high * at_low) / (at_high - at_low)
+        force, found = peg_past(q, excess, force, steps)
+        value = math.sqrt(max(1.0 - (found / largest) * (found / largest), 0.0)) - goal
+        if abs(value) < 1e-14:
+            break
+        if value > 0.0:
+            low, at_low = excess, value
+            at_high *= 0.5 if side > 0 else 1.0
+            side = 1
+        else:
+            high, at_high = excess, value
+            at_low *= 0.5 if side < 0 else 1.0
+            side = -1
+    return excess, force
 
 
 @compiled
@@ -188,68 +225,118 @@ def peg_contact(q: float, gamma: float, steps: int) -> tuple[float, float, float
             break
         force, arc = p, r
     if not found:
-        # Near the largest gamma: step the force up until gamma is passed, then bisect.
-        most_force, most_arc, most = last_peg(q, steps)
-        if gamma > most:
-            return most_force, most_arc, 0.0, 0.0, False
-        low, high = force, most_force
-        while True:
-            middle = 0.5 * (low + high)
-            if middle in (low, high):
-                break
-            r, found_gamma = peg_under(q, middle, arc, steps)
-            if found_gamma < gamma:
-                low, arc = middle, r
-            else:
-                high = middle
-        force = low
+        # Near the largest gamma, where force and arc length change without end.
+        most = last_peg(q, steps)
+        if gamma > most[2]:
+            return most[1], 1.0 + most[0] * most[0], 0.0, 0.0, False
+        low = math.sqrt(max(arc - 1.0, 1e-6))
+        excess, force = peg_between(q, gamma, low, max(force, 0.01 * q), most, steps)
+        arc = 1.0 + excess * excess
     x, _, theta = shoot(1.0 - q, arc, force, 0.0, steps)
     return force, arc, force * x, theta, True
 
 
 @compiled
+def follow_tip(
+    r: float,
+    height: float,
+    first: float,
+    turned: float,
+    to: float,
+    kind: int,
+    force: float,
+    rest: float,
+    steps: int,
+) -> tuple[int, float, float, bool]:
+    """Continue a contact of the tip with a plane from one angle past first touch to a larger one.
+
+    first: angle to the plane's normal at first touch; turned, to: rad past it; kind, force and rest
+    (tilt or arc length): the solution at ``turned``. Returns (kind, force, rest, whether it exists).
+    """
+    taper = 1.0 - r
+    step = to - turned
+    while to > turned:
+        aim = min(turned + step, to)
+        guess, guess_rest = force, rest
+        if turned == 0.0:
+            guess, guess_rest = 3.0 * r * aim / max(sin(first), 1e-3), rest + 0.5 * aim
+        p, q, found = solve(kind, taper, guess, guess_rest, height, first - aim, steps)
+        if kind == TIP and (not found or q > 0.0):
+            arc = 1.0 if turned > 0.0 else height / max(cos(first - aim), height)
+            p, q, found = solve(LYING, taper, guess, arc, height, first - aim, steps)
+            found = found and q <= 1.0
+            if found:
+                kind = LYING
+        if found:
+            force, rest, turned = p, q, aim
+            continue
+        step *= 0.5
+        if step < 1e-6:
+            return kind, force, rest, False
+    return kind, force, rest, True
+
+
+@compiled
+def tip_result(
+    r: float, kind: int, force: float, rest: float, steps: int
+) -> tuple[float, float, float]:
+    """(base moment, offset of the contact along the plane, arc length to it) of a solution."""
+    if kind == LYING:
+        offset, _y, _theta = shoot(1.0 - r, rest, force, 0.0, steps)
+        return force * offset, offset, rest
+    x, y, _theta = shoot(1.0 - r, 1.0, force, rest, steps)
+    offset = x * cos(rest) + y * sin(rest)
+    return force * offset, offset, 1.0
+
+
+@compiled
 def tip_contact(
     r: float, height: float, turn: float, steps: int
-) -> tuple[float, float, float, float, bool]:
+) -> tuple[float, float, float, bool]:
     """The tip on a frictionless plane, lengths in those of the whisker.
 
     r: tip over base diameter; height: distance of the base from the plane, in (0, 1); turn: angle
     between the straight shaft and the plane's normal, rad, at most acos(height), where it touches.
-    Returns (force, arc length to the contact, base moment, offset of the contact along the plane,
-    whether it exists), force in E I0 / L^2, moment in E I0 / L.
+    Returns (base moment in E I0 / L, offset of the contact along the plane, arc length to it,
+    whether it exists).
     """
-    taper = 1.0 - r
     first = atan2(math.sqrt(1.0 - height * height), height)
-    kind, force, rest = TIP, 0.0, first - 0.5 * math.pi
-    parts = int((first - turn) / 0.1) + 4
     total = first - turn
-    done, step = 0.0, total / parts
-    last_force, last_rest = force, rest
-    while total - done > 1e-15:
-        to = min(done + step, total)
-        ahead = (to - done) / step if done > 0.0 else 0.0
-        guess, guess_rest = force + (force - last_force) * ahead, rest + (rest - last_rest) * ahead
-        if done == 0.0:
-            guess, guess_rest = 3.0 * r * to / math.sqrt(1.0 - height * height), rest + 0.5 * to
-        p, q, found = solve(kind, taper, guess, guess_rest, height, first - to, steps)
-        if not found or (kind == TIP and q > 0.0):
-            if kind == TIP and (rest > -0.3 or (found and q > 0.0)):
-                other, arc, lies = solve(LYING, taper, force, 1.0, height, first - to, steps)
-                if lies and arc <= 1.0:
-                    kind, last_force, last_rest = LYING, other, arc
-                    force, rest, done = other, arc, to
-                    continue
-            step *= 0.5
-            if step < 1e-4 * total:
-                return force, 1.0, 0.0, 0.0, False
-            continue
-        last_force, last_rest, force, rest, done = force, rest, p, q, to
-    if kind == TIP:
-        x, y, _ = shoot(taper, 1.0, force, rest, steps)
-        offset = x * cos(rest) + y * sin(rest)
-        return force, 1.0, force * offset, offset, True
-    offset, _, _ = shoot(taper, rest, force, 0.0, steps)
-    return force, rest, force * offset, offset, True
+    kind, force, rest, found = TIP, 0.0, first - 0.5 * math.pi, True
+    parts = int(total / 0.1) + 2
+    for n in range(parts):
+        kind, force, rest, found = follow_tip(
+            r, height, first, total * n / parts, total * (n + 1) / parts, kind, force, rest, steps
+        )
+        if not found:
+            return 0.0, 0.0, 1.0, False
+    moment, offset, arc = tip_result(r, kind, force, rest, steps)
+    return moment, offset, arc, True
+
+
+@compiled
+def pinned_tip(
+    r: float, distance: float, gamma: float, steps: int
+) -> tuple[float, float, bool]:
+    """The tip held at a point, free to turn: (base moment in E I0 / L, tilt of the force, exists).
+
+    r: tip over base diameter; distance: from base to point over the length, below 1; gamma: rad.
+    """
+    tilt = 0.0
+    guess = 3.0 * r * gamma / distance
+    found = False
+    force = guess
+    for n in range(1, 9):
+        share = n / 8.0
+        bow = 1.0 - (1.0 - distance) * share * share
+        force, tilt, found = solve(
+            PINNED, 1.0 - r, guess * share if n == 1 else force * n / (n - 1), tilt, bow,
+            gamma * share, steps,
+        )
+        if not found:
+            return 0.0, 0.0, False
+    x, y, _theta = shoot(1.0 - r, 1.0, force, tilt, steps)
+    return force * (x * cos(tilt) + y * sin(tilt)), tilt, found
 
 
 @compiled

@@ -1,8 +1,10 @@
 """The pose cells' attractor: excitation, inhibition, path integration and read-out, compiled.
 
-Source: OpenRatSLAM's PosecellNetwork. Activity is float64[heading, y, x] on a torus; `alive` marks
-the heading layers that hold any, and all work is confined to them. The Gaussian kernels are applied
-one axis after the other, which equals the three-dimensional convolution.
+Source: OpenRatSLAM's PosecellNetwork. Activity is float64[heading, y, x] on a torus. `occupied`,
+uint8[3, longest axis], marks the headings, rows and columns that hold any; all work is confined to
+the marked layers and to the box of rows and columns around the marked ones, so that its cost
+follows the packet and not the grid. The Gaussian kernels are applied one axis after the other,
+which equals the three-dimensional convolution.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ Ints = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
 READOUT_HALF_WIDTH: Final = 3
+HEADING, ROW, COLUMN = 0, 1, 2
 
 
 def half_gaussian(width: int, sigma: float) -> Floats:
@@ -47,6 +50,25 @@ def _wrapped(index: int, length: int) -> int:
     if index < 0 or index >= length:
         index %= length
     return index
+
+
+@compiled
+def _arc(marks: Bytes, length: int) -> tuple[int, int]:
+    """Start and size of the shortest arc of a ring of `length` that holds all marked places."""
+    first, last = -1, -1
+    start, gap = 0, 0
+    for place in range(length):
+        if marks[place]:
+            if first < 0:
+                first = place
+            elif place - last > gap:
+                start, gap = place, place - last
+            last = place
+    if first < 0:
+        return 0, 0
+    if first + length - last > gap:
+        start, gap = first, first + length - last
+    return start, length - gap + 1
 
 
 @compiled
@@ -84,31 +106,33 @@ def _blur_line(out: Floats, source: Floats, first: int, stride: int, weights: Fl
 
 
 @compiled
-def _blur_layer(layer: Floats, n: int, weights: Floats, wide: Floats, wrap: Ints) -> None:
-    """Circular convolution of one n x n layer (flat) along x and y, in place."""
+def _blur_layer(
+    out: Floats,
+    source: Floats,
+    stride: int,
+    rows: Ints,
+    columns: Ints,
+    weights: Floats,
+    padded: Floats,
+) -> None:
+    """Convolve rows x columns of a layer along y and x, less a margin of one radius all round.
+
+    `source` is a layer of rows of `stride`; a row or column of -1 stands for zeros. Row j of the
+    result starts at out[j * len(columns)]; it is 2 radii shorter, what follows is not used.
+    """
+    m = columns.shape[0]
+    for p in range(rows.shape[0]):
+        target = padded[0, p * m : p * m + m]
+        if rows[p] < 0:
+            target[:] = 0.0
+            continue
+        line = source[rows[p] * stride : rows[p] * stride + stride]
+        for x in range(m):
+            target[x] = line[columns[x]] if columns[x] >= 0 else 0.0
     r = weights.shape[0] - 1
-    width = n + 2 * r
-    skip = (wrap.shape[0] - width) // 2
-    padded = wide[0]
-    for j in range(n):
-        row = layer[j * n : j * n + n]
-        target = padded[j * width : j * width + width]
-        for x in range(r):
-            target[x] = row[wrap[skip + x]]
-            target[r + n + x] = row[wrap[skip + r + n + x]]
-        middle = target[r : r + n]
-        for i in range(n):
-            middle[i] = row[i]
-    # along x, all rows at once; the 2 r cells at each joint of two rows are not used
-    blurred = wide[1]
-    _blur_line(blurred[: n * width - 2 * r], padded, r, 1, weights)
-    for y in range(width):
-        start = wrap[skip + y] * width
-        row = blurred[start : start + n]
-        target = padded[y * n : y * n + n]
-        for i in range(n):
-            target[i] = row[i]
-    _blur_line(layer, padded, r * n, n, weights)
+    count = (rows.shape[0] - 2 * r) * m
+    _blur_line(padded[1, :count], padded[0], r * m, m, weights)
+    _blur_line(out[: count - 2 * r], padded[1], r, 1, weights)
 
 
 @compiled
@@ -127,8 +151,7 @@ def _blur_heading(out: Floats, source: Floats, alive: Bytes, k: int, weights: Fl
 
 
 @compiled
-def _dilate(alive: Bytes, radius: int) -> Bytes:
-    layers = alive.shape[0]
+def _dilate(alive: Bytes, layers: int, radius: int) -> Bytes:
     result = np.zeros(layers, dtype=np.uint8)
     for k in range(layers):
         if alive[k]:
@@ -138,12 +161,32 @@ def _dilate(alive: Bytes, radius: int) -> Bytes:
 
 
 @compiled
+def _torus_places(first: int, count: int, n: int) -> Ints:
+    """first .. first + count - 1 on a ring of n places."""
+    places = np.empty(count, dtype=np.int64)
+    for p in range(count):
+        places[p] = _wrapped(first + p, n)
+    return places
+
+
+@compiled
+def _box_places(first: int, count: int, size: int, n: int) -> Ints:
+    """The same within a box of `size` places: -1 outside, unless the box is the whole ring."""
+    places = np.empty(count, dtype=np.int64)
+    for p in range(count):
+        place = first + p
+        if size == n:
+            place = _wrapped(place, n)
+        places[p] = place if 0 <= place < size else -1
+    return places
+
+
+@compiled
 def iterate(
     cells: Floats,
-    alive: Bytes,
+    occupied: Bytes,
     work: Floats,
-    wide: Floats,
-    wrap: Ints,
+    padded: Floats,
     excite: Floats,
     inhibit: Floats,
     global_inhibition: float,
@@ -156,70 +199,185 @@ def iterate(
     circle_th: Floats,
     best: Floats,
 ) -> bool:
-    """Iterations of the network with motion `step` (cells) and `spin` (heading cells) each."""
+    """Iterations of the network with motion `step` (cells) and `spin` (heading cells) each.
+
+    False when no activity is left. work: float64[2, headings, room for a layer], padded:
+    float64[2, room for a layer], where a layer takes n + 2 radii rows of as many columns.
+    """
     layers = cells.shape[0]
     n = cells.shape[1]
     flat = cells.reshape(layers, n * n)
-    excited = work[0]
-    rest = work[1]
-    column = np.empty(n * n)
+    blurred, excited = work[0], work[1]
+    alive = occupied[HEADING]
+    out_radius, in_radius = excite.shape[0] - 1, inhibit.shape[0] - 1
     for _ in range(iterations):
+        top, height = _arc(occupied[ROW], n)
+        left, width = _arc(occupied[COLUMN], n)
+        grown_height = min(n, height + 2 * out_radius)
+        grown_width = min(n, width + 2 * out_radius)
+        top -= (grown_height - height) // 2
+        left -= (grown_width - width) // 2
+        height, width = grown_height, grown_width
+        rows = _torus_places(top - out_radius, height + 2 * out_radius, n)
+        columns = _torus_places(left - out_radius, width + 2 * out_radius, n)
+        stride = columns.shape[0]
+        size = height * stride
         for k in range(layers):
             if alive[k]:
-                _blur_layer(flat[k], n, excite, wide, wrap)
-        raised = _dilate(alive, excite.shape[0] - 1)
+                _blur_layer(blurred[k], flat[k], n, rows, columns, excite, padded)
+        raised = _dilate(alive, layers, out_radius)
         for k in range(layers):
             if raised[k]:
-                _blur_heading(excited[k], flat, alive, k, excite)
-        kept = _dilate(raised, inhibit.shape[0] - 1)
-        for k in range(layers):
-            if not raised[k]:
-                excited[k] = 0.0
-            if not faithful:
-                # Without negative activity inhibition only lowers: little is already nothing.
-                enough = 0
-                layer = excited[k]
-                for x in range(n * n):
-                    enough += layer[x] >= global_inhibition
-                kept[k] = enough > 0
-        column[:] = 0.0
+                _blur_heading(excited[k, :size], blurred, alive, k, excite)
         for k in range(layers):
             if alive[k]:
-                flat[k] = 0.0
-            if kept[k]:
-                layer = excited[k]
-                left = rest[k]
-                _blur_heading(left, excited, raised, k, inhibit)
-                _blur_layer(left, n, inhibit, wide, wrap)
-                for x in range(n * n):
-                    value = layer[x] - left[x]
-                    value = value - global_inhibition if value >= global_inhibition else 0.0
-                    left[x] = value
-                    column[x] += value
-        total = 0.0
-        for x in range(n * n):
-            total += column[x]
-        if not total > 0.0:
+                for p in range(out_radius, rows.shape[0] - out_radius):
+                    flat[k, rows[p] * n : rows[p] * n + n] = 0.0
+
+        kept = _dilate(raised, layers, in_radius)
+        low_row, high_row, low_column, high_column = 0, height, 0, width
+        if not faithful:
+            # without negative activity inhibition only lowers: little is already nothing
+            low_row, high_row, low_column, high_column = _enough(
+                excited, raised, kept, height, width, stride, global_inhibition
+            )
+        if high_row <= low_row:
             return False
         for k in range(layers):
-            alive[k] = 0
-        integrate(cells, alive, rest, kept, 1.0 / total, step, spin, faithful, directions)
-    return read_out(cells, alive, faithful, circle_xy, circle_th, best)
+            if kept[k] and not raised[k]:
+                excited[k, :size] = 0.0
+        inner_rows = _box_places(low_row - in_radius, high_row - low_row + 2 * in_radius, height, n)
+        inner_columns = _box_places(
+            low_column - in_radius, high_column - low_column + 2 * in_radius, width, n
+        )
+        total = _inhibit(
+            excited,
+            blurred,
+            raised,
+            kept,
+            size,
+            stride,
+            inner_rows,
+            inner_columns,
+            inhibit,
+            global_inhibition,
+            padded,
+        )
+        if not total > 0.0:
+            return False
+        occupied[:] = 0
+        integrate(
+            cells,
+            occupied,
+            blurred,
+            kept,
+            _torus_places(top + low_row, high_row - low_row, n),
+            _torus_places(left + low_column, high_column - low_column, n),
+            inner_columns.shape[0],
+            1.0 / total,
+            step,
+            spin,
+            faithful,
+            directions,
+        )
+    return read_out(cells, occupied, faithful, circle_xy, circle_th, best)
+
+
+@compiled
+def _enough(
+    excited: Floats,
+    raised: Bytes,
+    kept: Bytes,
+    height: int,
+    width: int,
+    stride: int,
+    least: float,
+) -> tuple[int, int, int, int]:
+    """Mark the layers and bound the rows and columns where some activity reaches `least`."""
+    size = height * stride
+    highest = np.zeros(size)
+    for k in range(raised.shape[0]):
+        kept[k] = 0
+        if raised[k]:
+            layer = excited[k, :size]
+            enough = 0
+            for x in range(size):
+                enough += layer[x] >= least
+                highest[x] = layer[x] if layer[x] > highest[x] else highest[x]
+            kept[k] = enough > 0
+    low_row, high_row, low_column, high_column = height, 0, width, 0
+    for j in range(height):
+        for i in range(width):
+            if highest[j * stride + i] >= least:
+                low_row, high_row = min(low_row, j), j + 1
+                low_column, high_column = min(low_column, i), max(high_column, i + 1)
+    return low_row, high_row, low_column, high_column
+
+
+@compiled
+def _inhibit(
+    excited: Floats,
+    result: Floats,
+    raised: Bytes,
+    kept: Bytes,
+    size: int,
+    stride: int,
+    rows: Ints,
+    columns: Ints,
+    weights: Floats,
+    global_inhibition: float,
+    padded: Floats,
+) -> float:
+    """What inhibition leaves of the kept layers within a box, and its sum.
+
+    rows, columns: the box and a radius around it, as places in `excited`. Row j of a layer of the
+    result starts at j * len(columns).
+    """
+    radius = weights.shape[0] - 1
+    m = columns.shape[0]
+    height, width = rows.shape[0] - 2 * radius, m - 2 * radius
+    first_column = columns[radius]
+    sums = np.zeros(width)
+    line = np.empty(size)
+    for k in range(kept.shape[0]):
+        if not kept[k]:
+            continue
+        _blur_heading(line, excited, raised, k, weights)
+        _blur_layer(result[k], line, stride, rows, columns, weights, padded)
+        for j in range(height):
+            start = rows[j + radius] * stride + first_column
+            here = excited[k, start : start + width]
+            lost = result[k, j * m : j * m + width]
+            for x in range(width):
+                value = here[x] - lost[x]
+                value = value - global_inhibition if value >= global_inhibition else 0.0
+                lost[x] = value
+                sums[x] += value
+    total = 0.0
+    for x in range(width):
+        total += sums[x]
+    return total
 
 
 @compiled
 def integrate(
     cells: Floats,
-    alive: Bytes,
+    occupied: Bytes,
     source: Floats,
     kept: Bytes,
+    rows: Ints,
+    columns: Ints,
+    stride: int,
     scale: float,
     step: float,
     spin: float,
     faithful: bool,
     directions: Floats,
 ) -> None:
-    """Add `source` times `scale`, moved by step and spin, to the empty `cells`."""
+    """Add `source` times `scale`, moved by step and spin, to the empty `cells`; mark `occupied`.
+
+    source[k, y * stride + x] is the activity of the cell in rows[y], columns[x].
+    """
     layers = cells.shape[0]
     n = cells.shape[1]
     speed = abs(step)
@@ -256,12 +414,20 @@ def integrate(
         corner_i = n - 1 if up_i > right_i else 0
         first = (k + sign * low) % layers
         second = (k + sign * high) % layers
-        for j in range(n):
-            for i in range(n):
-                value = source[k, j * n + i]
+        for y in range(rows.shape[0]):
+            j = rows[y]
+            j_up = _wrapped(j + up_j, n)
+            j_right = _wrapped(j + right_j, n)
+            j_both = _wrapped(j_up + right_j, n)
+            for x in range(columns.shape[0]):
+                value = source[k, y * stride + x]
                 if value == 0.0:
                     continue
                 value *= scale
+                i = columns[x]
+                i_up = _wrapped(i + up_i, n)
+                i_right = _wrapped(i + right_i, n)
+                i_both = _wrapped(i_up + right_i, n)
                 kept_up, kept_right = 1.0, 1.0
                 if faithful:
                     # what leaves one corner upwards and the opposite one to the right is lost
@@ -269,18 +435,16 @@ def integrate(
                         kept_up = 0.0
                     if j == n - 1 - corner_j and i == n - 1 - corner_i:
                         kept_right = 0.0
-                j_up = _wrapped(j + up_j, n)
-                i_up = _wrapped(i + up_i, n)
-                j_right = _wrapped(j + right_j, n)
-                i_right = _wrapped(i + right_i, n)
-                j_both = _wrapped(j_up + right_j, n)
-                i_both = _wrapped(i_up + right_i, n)
+                for j_reached in (j, j_up, j_right, j_both):
+                    occupied[ROW, j_reached] = 1
+                for i_reached in (i, i_up, i_right, i_both):
+                    occupied[COLUMN, i_reached] = 1
                 for part in range(2):
                     weight = (1.0 - far if part == 0 else far) * value
                     if weight == 0.0:
                         continue
                     layer = first if part == 0 else second
-                    alive[layer] = 1
+                    occupied[HEADING, layer] = 1
                     cells[layer, j, i] += weight * stay
                     cells[layer, j_up, i_up] += weight * to_up * kept_up
                     cells[layer, j_right, i_right] += weight * to_right * kept_right
@@ -290,7 +454,7 @@ def integrate(
 @compiled
 def read_out(
     cells: Floats,
-    alive: Bytes,
+    occupied: Bytes,
     faithful: bool,
     circle_xy: Floats,
     circle_th: Floats,
@@ -302,12 +466,15 @@ def read_out(
     largest = 0.0
     at_k, at_j, at_i = -1, -1, -1
     for k in range(layers):
-        if alive[k]:
-            for j in range(n):
-                for i in range(n):
-                    if cells[k, j, i] > largest:
-                        largest = cells[k, j, i]
-                        at_k, at_j, at_i = k, j, i
+        if not occupied[HEADING, k]:
+            continue
+        for j in range(n):
+            if not occupied[ROW, j]:
+                continue
+            for i in range(n):
+                if cells[k, j, i] > largest:
+                    largest = cells[k, j, i]
+                    at_k, at_j, at_i = k, j, i
     if at_k < 0:
         return False
     half = READOUT_HALF_WIDTH
@@ -316,7 +483,7 @@ def read_out(
     sum_th = np.zeros(layers)
     for dk in range(-half, half + 1):
         k = _wrapped(at_k + dk, layers)
-        if not alive[k]:
+        if not occupied[HEADING, k]:
             continue
         for dj in range(-half, half + 1):
             j = _wrapped(at_j + dj, n)

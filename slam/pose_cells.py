@@ -1,7 +1,7 @@
 """The pose-cell network: a packet of activity on a torus of x, y and heading.
 
 Source: OpenRatSLAM's PosecellNetwork. One iteration excites, inhibits, normalises and moves the
-packet; the work is confined to the heading layers that hold activity. Positions are in cells:
+packet; the work is confined to the neighbourhood of the activity. Positions are in cells:
 x, y in [0, pc_dim_xy), heading in [0, pc_dim_th). Heading layer k moves along
 (sin 2 pi k/T, cos 2 pi k/T): only distances between poses of this network have a meaning.
 
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from vibrissa.numerics import compiled, exp
 from vibrissa.slam.angles import TAU
-from vibrissa.slam.attractor import half_gaussian, iterate, unit_circle
+from vibrissa.slam.attractor import COLUMN, HEADING, ROW, half_gaussian, iterate, unit_circle
 from vibrissa.slam.config import RatSlamConfig
 from vibrissa.slam.growing import grown
 from vibrissa.slam.interface import (
@@ -67,14 +67,13 @@ class PoseCells:
         self._config = c
         self._cells = np.zeros((t, n, n), dtype=np.float64)
         self._cells[t // 2, n // 2, n // 2] = 1.0
-        self._alive = np.zeros(t, dtype=np.uint8)
-        self._alive[t // 2] = 1
+        self._occupied = np.zeros((3, max(t, n)), dtype=np.uint8)
+        self._occupied[(HEADING, ROW, COLUMN), (t // 2, n // 2, n // 2)] = 1
         self._excite = half_gaussian(c.pc_w_e_dim, c.pc_w_e_var)
         self._inhibit = half_gaussian(c.pc_w_i_dim, c.pc_w_i_var)
-        self._work = np.zeros((2, t, n * n), dtype=np.float64)
-        radius = max(c.pc_w_e_dim, c.pc_w_i_dim) // 2
-        self._wrap = np.array([x % n for x in range(-radius, n + radius)], dtype=np.int64)
-        self._wide = np.zeros((2, (n + 2 * radius) * (n + 2 * radius)), dtype=np.float64)
+        room = (n + 2 * (max(c.pc_w_e_dim, c.pc_w_i_dim) // 2)) ** 2
+        self._work = np.zeros((2, t, room), dtype=np.float64)
+        self._padded = np.zeros((2, room), dtype=np.float64)
         self._angles_xy = unit_circle(n)
         self._angles_th = unit_circle(t)
         self._directions = np.array([k * TAU / t for k in range(t)], dtype=np.float64)
@@ -186,10 +185,9 @@ class PoseCells:
         iterations = 1 if c.faithful else max(1, math.ceil(abs(step)))
         alive = iterate(
             self._cells,
-            self._alive,
+            self._occupied,
             self._work,
-            self._wide,
-            self._wrap,
+            self._padded,
             self._excite,
             self._inhibit,
             float(c.pc_global_inhib),
@@ -261,7 +259,7 @@ class PoseCells:
             if i >= n or j >= n or k >= t:
                 return
         self._cells[k, j, i] += energy
-        self._alive[k] = 1
+        self._occupied[(HEADING, ROW, COLUMN), (k, j, i)] = 1
 
     def _create(self, source: int) -> Action:
         new = self._experiences

@@ -1,4 +1,4 @@
-"""How the head's messages lie in CAN FD frames, the database that says so, and the bus load.
+"""How the head's messages lie in CAN FD frames, and how much of the bus they need.
 
 A sample does not fit into one frame and eighteen frames do not fit onto a 5 Mbit/s bus, so two
 packed frames of 64 bytes carry it. All fields are little-endian.
@@ -18,24 +18,14 @@ import math
 import struct
 from typing import Final
 
-import cantools.database
-from cantools.database.can import Database, Message, Signal
-from cantools.database.can.attribute import Attribute
-from cantools.database.can.attribute_definition import AttributeDefinition
-from cantools.database.can.formats.dbc_specifics import DbcSpecifics
-from cantools.database.conversion import BaseConversion
-
 from vibrissa.messages.types import TICK_HZ, WHISKERS
 from vibrissa.rig.devices.errors import DeviceRefused
 from vibrissa.rig.devices.protocol import (
     CHANNELS,
-    COMMAND,
     HELLO_PLEASE,
     PROTOCOL,
     START,
     STOP,
-    THETA,
-    Channel,
     Command,
     Foreign,
     FromHead,
@@ -55,15 +45,6 @@ HALF: Final = CHANNELS // 2
 PART: Final = 60
 """Bytes of a hello per frame."""
 FRAME_SIZES: Final = (*range(9), 12, 16, 20, 24, 32, 48, 64)
-
-FRAME_FORMAT: Final = AttributeDefinition(
-    "VFrameFormat",
-    default_value="StandardCAN",
-    kind="BO_",
-    type_name="ENUM",
-    choices=["StandardCAN", "ExtendedCAN", *("reserved",) * 12, "StandardCAN_FD"],
-)
-"""How CAN databases say that a message is an FD frame."""
 
 _HEAD_A = struct.Struct("<IIBB")
 _HEAD_B = struct.Struct("<IIBB")
@@ -190,73 +171,6 @@ class Assembler:
 def _padded(data: bytes) -> bytes:
     size = next(n for n in FRAME_SIZES if n >= len(data))
     return data.ljust(size, b"\0")
-
-
-# The database
-
-
-def database(hello: Hello) -> Database:
-    """The CAN database of a head, made from its own channel map; `as_dbc_string()` writes it."""
-    command = [_number("tick", 0, 32)]
-    command += [
-        _scaled(f"theta_set_{i:02d}", 4 + 2 * i, hello.command_scale, "rad")
-        for i in range(WHISKERS)
-    ]
-    halves = (hello.channels[:HALF], hello.channels[HALF:])
-    sample_a = [_number("seq_a", 0, 32), _number("time", 4, 32, "us"), _number("flags", 8, 8)]
-    sample_b = [_number("seq_b", 0, 32), _number("answers", 4, 32)]
-    for signals, half, version in zip(
-        (sample_a, sample_b), halves, ("version_a", "version_b"), strict=True
-    ):
-        signals.append(_number(version, 9, 8))
-        signals += [
-            _scaled(c.name, 10 + 2 * k, c.scale, _unit(c)) for k, c in enumerate(half)
-        ]
-    control = [_number(n, at, 8) for n, at in (("version_c", 0), ("type", 1), ("batch", 2))]
-    messages = [
-        _message(COMMAND_ID, "command", COMMAND_BYTES, "host", command),
-        _message(SAMPLE_A_ID, "sample_a", SAMPLE_BYTES, "head", sample_a),
-        _message(SAMPLE_B_ID, "sample_b", SAMPLE_BYTES, "head", sample_b),
-        _message(CONTROL_ID, "control", CONTROL_BYTES, "host", [*control, _number("nonce", 4, 32)]),
-    ]
-    nodes = [cantools.database.can.Node(name) for name in ("host", "head")]
-    specifics = DbcSpecifics(attribute_definitions={FRAME_FORMAT.name: FRAME_FORMAT})
-    return Database(messages, nodes, version=str(PROTOCOL), dbc_specifics=specifics, strict=True)
-
-
-def _unit(channel: Channel) -> str:
-    return "rad" if channel.kind == THETA else "N m"
-
-
-def _number(name: str, at: int, bits: int, unit: str = "") -> Signal:
-    return Signal(name, 8 * at, bits, byte_order="little_endian", unit=unit)
-
-
-def _scaled(name: str, at: int, scale: float, unit: str) -> Signal:
-    conversion = BaseConversion.factory(scale=float(f"{scale:.7g}"))
-    return Signal(
-        name,
-        8 * at,
-        16,
-        byte_order="little_endian",
-        is_signed=True,
-        conversion=conversion,
-        unit=unit,
-    )
-
-
-def _message(identifier: int, name: str, size: int, sender: str, signals: list[Signal]) -> Message:
-    choice = Attribute("StandardCAN_FD", FRAME_FORMAT)
-    return Message(
-        identifier,
-        name,
-        size,
-        signals,
-        senders=[sender],
-        is_fd=True,
-        dbc_specifics=DbcSpecifics(attributes={FRAME_FORMAT.name: choice}),
-        strict=True,
-    )
 
 
 # The bus load

@@ -43,7 +43,7 @@ class ClockRelation:
         """How much faster the host's clock runs: 1e-6 is one ppm; 0 until it can be told."""
         if len(self._points) < 2:
             return 0.0
-        x, y, xx, xy = self._sums()
+        _, _, xx, xy = self._sums()
         return xy / xx if xx else 0.0
 
     def host_ns(self, device_ns: int) -> int:

@@ -15,7 +15,6 @@ import numpy as np
 from vibrissa.control.kinematics import WHISKERS, Float32s
 from vibrissa.rig.devices.protocol import (
     BAD_COMMAND,
-    CHANNELS,
     NO_ANSWER,
     RETRACTING,
     Command,
@@ -107,5 +106,3 @@ class Firmware:
         values = np.concatenate((theta, x, y))[self._order] * self._per_unit
         counts = np.clip(np.rint(values), -32768, 32767).astype("<i2").tobytes()
         return RawSample(seq, seq * PERIOD_US % _WRAP, self._answers, flags, counts)
-
-

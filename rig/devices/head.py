@@ -7,6 +7,7 @@ numbering of samples over gaps and resets, finding the device again.
 from __future__ import annotations
 
 import collections
+import contextlib
 import random
 import time
 from abc import ABC, abstractmethod
@@ -20,7 +21,6 @@ from vibrissa.control.kinematics import WHISKERS, Float32s
 from vibrissa.rig.devices import protocol
 from vibrissa.rig.devices.clock import ClockRelation
 from vibrissa.rig.devices.errors import (
-    DeviceError,
     DeviceLost,
     DeviceRefused,
     DeviceUnavailable,
@@ -45,12 +45,11 @@ ANSWER_S: Final = 2.0
 """How long a head may take to introduce itself."""
 ASK_S: Final = 0.1
 """How often it is asked while it says nothing."""
-OTHERS_S: Final = 0.05
+OTHERS_S = 0.05
 """How long a second head may take to give itself away."""
 SILENCE_S: Final = 0.1
 RETRY_S: Final = 0.1
 _WRAP: Final = 2**32
-_FAR: Final = 2**31
 
 
 class Reading(NamedTuple):
@@ -112,6 +111,7 @@ class HeadDevice(ABC):
     """
 
     info: Hello
+    _others_s = OTHERS_S
 
     def __init__(self, name: str, *, batch: int = 1, patience: float = HEAD.patience) -> None:
         """name: for messages; batch: samples the device may send in one write, 1 to 100."""
@@ -131,7 +131,6 @@ class HeadDevice(ABC):
         self._sample = -1
         self._device_us = 0
         self._time_us = 0
-        self._host_ns = 0
         self._heard_ns = 0
         self._asked_ns = 0
         self._tried_ns = 0
@@ -158,10 +157,8 @@ class HeadDevice(ABC):
     def close(self) -> None:
         """Stop the samples and let go; the drives retract by their watchdog. May be repeated."""
         if self._linked:
-            try:
+            with contextlib.suppress(OSError):
                 self._send(Stop())
-            except (OSError, DeviceError):
-                pass  # it is gone, and so are we
             self._linked = False
             self._close_link()
 
@@ -267,8 +264,6 @@ class HeadDevice(ABC):
         answers[0].check()
         self._adopt(answers[0])
 
-    _others_s = OTHERS_S
-
     def _adopt(self, hello: Hello) -> None:
         self.info = hello
         where = {(c.kind, c.whisker): k for k, c in enumerate(hello.channels)}
@@ -340,7 +335,6 @@ class HeadDevice(ABC):
             self.counters.resets += 1
             self.info = hello
             self._seq = None
-            self.clock.forget()
         elif self._astray:
             self._seq = None
         self._try_to_send(Start(self._batch))
@@ -348,12 +342,12 @@ class HeadDevice(ABC):
     def _sampled(self, raw: RawSample, host_ns: int) -> None:
         seq, time_us, answers, flags, counts = raw
         if self._seq is None:
-            elapsed = round((host_ns - self._host_ns) / TICK_NS) if self._sample >= 0 else 1
-            steps = max(elapsed, 1)
+            steps = max(self._elapsed(host_ns), 1) if self._sample >= 0 else 1
             self._device_us += steps * (TICK_NS // 1000)
+            self.clock.forget()
         else:
             steps = (seq - self._seq) % _WRAP
-            if steps == 0 or steps > self._plausible(host_ns):
+            if steps == 0 or steps > 2000 + 2 * self._elapsed(host_ns):
                 self.counters.strays += 1
                 self._astray = steps != 0
                 if steps and host_ns - self._asked_ns > ASK_S * 1e9:
@@ -366,7 +360,7 @@ class HeadDevice(ABC):
         self._sample += steps
         self._seq, self._time_us = seq, time_us
         self._astray = False
-        self._host_ns = self._heard_ns = host_ns
+        self._heard_ns = host_ns
         self.clock.see(self._device_us * 1000, host_ns)
         self.counters.samples += 1
         values = np.frombuffer(counts, "<i2")
@@ -386,6 +380,6 @@ class HeadDevice(ABC):
             )
         )
 
-    def _plausible(self, host_ns: int) -> int:
-        """Samples that can have been taken since the last one, and some more."""
-        return 2000 + 2 * (host_ns - self._host_ns) // TICK_NS
+    def _elapsed(self, host_ns: int) -> int:
+        """Ticks of host time from when the last sample was taken, however late it was read."""
+        return round((host_ns - self.clock.host_ns(self._device_us * 1000)) / TICK_NS)

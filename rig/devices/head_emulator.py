@@ -41,9 +41,7 @@ class HeadEmulator(ABC):
         self.firmware = make_firmware(arguments, self.ear)
         self._waiting: list[RawSample] = []
         self.line = Line(arguments.seed)
-        self.clock = DeviceClock(
-            arguments.drift * 1e-6, arguments.jitter * 1e-6, arguments.seed
-        )
+        self.clock = DeviceClock(arguments.drift * 1e-6, arguments.jitter * 1e-6, arguments.seed)
         self.orders = Orders(
             {
                 "errors": self.line.errors,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import time
@@ -50,10 +51,8 @@ class SerialHead(HeadDevice):
     def _close_link(self) -> None:
         link, self._serial = self._serial, None
         if link is not None:
-            try:
+            with contextlib.suppress(OSError):  # its device file may be gone already
                 link.close()
-            except OSError:
-                pass  # its device file is gone already
 
     def _receive(self, timeout: float) -> Iterator[FromHead]:
         fd = self._serial.fileno()

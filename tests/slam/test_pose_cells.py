@@ -54,7 +54,10 @@ def settled(config, steps=60):
 def place(cells, activity):
     """Put a state into a network."""
     cells._cells[:] = activity
-    cells._alive[:] = (activity != 0.0).any(axis=(1, 2))
+    cells._occupied[:] = 0
+    for marks, others in zip(cells._occupied, ((1, 2), (0, 2), (0, 1)), strict=True):
+        used = (activity != 0.0).any(axis=others)
+        marks[: len(used)] = used
 
 
 def integrated(activity, step, spin, exact):
@@ -64,9 +67,12 @@ def integrated(activity, step, spin, exact):
     moved = np.zeros_like(activity)
     integrate(
         moved,
-        np.zeros(layers, np.uint8),
+        np.zeros((3, max(layers, n)), np.uint8),
         activity.reshape(layers, n * n),
         np.ones(layers, np.uint8),
+        np.arange(n),
+        np.arange(n),
+        n,
         1.0,
         step,
         spin,
