@@ -138,7 +138,9 @@ def play(log: Path, on_progress: OnProgress = silent, endpoint: str = "") -> dic
             began = began if began is not None else time.monotonic() - record.t * 1e-9
             left = began + record.t * 1e-9 - time.monotonic()
             if left > 0:
+                port.flush()
                 time.sleep(left)
+                port.subscribers()  # whoever has come to look since
             port.publish(frame_of(record))
             published += 1
             t = max(t, record.t)

@@ -37,8 +37,8 @@ from vibrissa.rig.elastica import (
     tip_result,
 )
 
-SIZE = 33
-STEPS = 96  # of the shooting, a hundred times finer than the interpolation
+SIZE = 49
+STEPS = 64  # of the shooting, far finer than the interpolation
 LEAST_Q = 0.1
 LEAST_HEIGHT = 0.05
 MOMENT, ARC, ANGLE, MOST = range(4)  # of the peg table

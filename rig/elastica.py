@@ -315,24 +315,19 @@ def tip_contact(
 
 
 @compiled
-def pinned_tip(
-    r: float, distance: float, gamma: float, steps: int
-) -> tuple[float, float, bool]:
+def pinned_tip(r: float, distance: float, gamma: float, steps: int) -> tuple[float, float, bool]:
     """The tip held at a point, free to turn: (base moment in E I0 / L, tilt of the force, exists).
 
-    r: tip over base diameter; distance: from base to point over the length, below 1; gamma: rad.
+    r: tip over base diameter; distance: from base to point over the length, below 1; gamma: rad,
+    near that at which a peg at this distance would let the tip slip. From there it is continued.
     """
-    tilt = 0.0
-    guess = 3.0 * r * gamma / distance
-    found = False
-    force = guess
-    for n in range(1, 9):
-        share = n / 8.0
-        bow = 1.0 - (1.0 - distance) * share * share
-        force, tilt, found = solve(
-            PINNED, 1.0 - r, guess * share if n == 1 else force * n / (n - 1), tilt, bow,
-            gamma * share, steps,
-        )
+    q = 1.0 - (1.0 - r) * distance
+    excess = math.sqrt(1.0 / distance - 1.0)
+    force, start = peg_past(q, excess, 3.0 * q * excess * math.sqrt(10.0 * q), steps)
+    force, tilt, found = force / (distance * distance), 0.0, True
+    for n in range(1, 5):
+        to = start + (gamma - start) * n / 4.0
+        force, tilt, found = solve(PINNED, 1.0 - r, force, tilt, distance, to, steps)
         if not found:
             return 0.0, 0.0, False
     x, y, _theta = shoot(1.0 - r, 1.0, force, tilt, steps)

@@ -21,6 +21,7 @@ from vibrissa.slam.angles import TAU
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
+Places = NDArray[np.uint64]
 
 READOUT_HALF_WIDTH: Final = 3
 HEADING, ROW, COLUMN = 0, 1, 2
@@ -109,45 +110,63 @@ def _blur_line(out: Floats, source: Floats, first: int, stride: int, weights: Fl
 def _blur_layer(
     out: Floats,
     source: Floats,
-    stride: int,
-    rows: Ints,
-    columns: Ints,
+    window: Places,
+    width: int,
     weights: Floats,
     padded: Floats,
 ) -> None:
-    """Convolve rows x columns of a layer along y and x, less a margin of one radius all round.
+    """Convolve a window of a layer along y and x, less a margin of one radius all round.
 
-    `source` is a layer of rows of `stride`; a row or column of -1 stands for zeros. Row j of the
-    result starts at out[j * len(columns)]; it is 2 radii shorter, what follows is not used.
+    source[window[q]] is what lies at row q // width, column q % width of the window. Row j of the
+    result starts at out[j * width]; it is 2 radii shorter, what follows is not used.
     """
-    m = columns.shape[0]
-    for p in range(rows.shape[0]):
-        target = padded[0, p * m : p * m + m]
-        if rows[p] < 0:
-            target[:] = 0.0
-            continue
-        line = source[rows[p] * stride : rows[p] * stride + stride]
-        for x in range(m):
-            target[x] = line[columns[x]] if columns[x] >= 0 else 0.0
+    gathered, blurred = padded[0], padded[1]
+    for q in range(window.shape[0]):
+        gathered[q] = source[window[q]]
     r = weights.shape[0] - 1
-    count = (rows.shape[0] - 2 * r) * m
-    _blur_line(padded[1, :count], padded[0], r * m, m, weights)
-    _blur_line(out[: count - 2 * r], padded[1], r, 1, weights)
+    count = window.shape[0] - 2 * r * width
+    _blur_line(blurred[:count], gathered, r * width, width, weights)
+    _blur_line(out[: count - 2 * r], blurred, r, 1, weights)
 
 
 @compiled
 def _blur_heading(out: Floats, source: Floats, alive: Bytes, k: int, weights: Floats) -> None:
-    """One layer of the circular convolution along heading."""
-    layers = source.shape[0]
+    """One layer of the circular convolution along heading; the layer behind the last is nothing."""
+    layers = source.shape[0] - 1
+    m = out.shape[0]
+    radius = weights.shape[0] - 1
+    near = np.full(7, layers, dtype=np.uint64)
+    if radius in (2, 3):
+        for t in range(-radius, radius + 1):
+            neighbour = _wrapped(k + t, layers)
+            if alive[neighbour]:
+                near[3 + t] = neighbour
+        l3, l2, l1, here, r1, r2, r3 = near[0], near[1], near[2], near[3], near[4], near[5], near[6]
+        w0, w1, w2 = weights[0], weights[1], weights[2]
+        if radius == 2:
+            for x in range(m):
+                out[x] = (
+                    w0 * source[here, x]
+                    + w1 * (source[l1, x] + source[r1, x])
+                    + w2 * (source[l2, x] + source[r2, x])
+                )
+        else:
+            w3 = weights[3]
+            for x in range(m):
+                out[x] = (
+                    w0 * source[here, x]
+                    + w1 * (source[l1, x] + source[r1, x])
+                    + w2 * (source[l2, x] + source[r2, x])
+                    + w3 * (source[l3, x] + source[r3, x])
+                )
+        return
     out[:] = 0.0
-    r = weights.shape[0] - 1
-    for t in range(-r, r + 1):
+    for t in range(-radius, radius + 1):
         neighbour = _wrapped(k + t, layers)
         if alive[neighbour]:
             w = weights[abs(t)]
-            row = source[neighbour]
-            for x in range(out.shape[0]):
-                out[x] += w * row[x]
+            for x in range(m):
+                out[x] += w * source[neighbour, x]
 
 
 @compiled
@@ -170,15 +189,39 @@ def _torus_places(first: int, count: int, n: int) -> Ints:
 
 
 @compiled
-def _box_places(first: int, count: int, size: int, n: int) -> Ints:
-    """The same within a box of `size` places: -1 outside, unless the box is the whole ring."""
-    places = np.empty(count, dtype=np.int64)
-    for p in range(count):
-        place = first + p
-        if size == n:
-            place = _wrapped(place, n)
-        places[p] = place if 0 <= place < size else -1
-    return places
+def _torus_window(rows: Ints, columns: Ints, n: int) -> Places:
+    """Where the cells of rows x columns lie in a layer of n x n."""
+    m = columns.shape[0]
+    window = np.empty(rows.shape[0] * m, dtype=np.uint64)
+    for p in range(rows.shape[0]):
+        for x in range(m):
+            window[p * m + x] = rows[p] * n + columns[x]
+    return window
+
+
+@compiled
+def _box_window(
+    top: int,
+    rows: int,
+    left: int,
+    columns: int,
+    height: int,
+    width: int,
+    stride: int,
+    n: int,
+) -> Places:
+    """Where a window lies in a box of height x width; behind the box, height * stride, is a zero.
+
+    A box as high or wide as the torus closes on itself.
+    """
+    window = np.empty(rows * columns, dtype=np.uint64)
+    for p in range(rows):
+        j = _wrapped(top + p, n) if height == n else top + p
+        for x in range(columns):
+            i = _wrapped(left + x, n) if width == n else left + x
+            inside = 0 <= j < height and 0 <= i < width
+            window[p * columns + x] = j * stride + i if inside else height * stride
+    return window
 
 
 @compiled
@@ -201,8 +244,9 @@ def iterate(
 ) -> bool:
     """Iterations of the network with motion `step` (cells) and `spin` (heading cells) each.
 
-    False when no activity is left. work: float64[2, headings, room for a layer], padded:
-    float64[2, room for a layer], where a layer takes n + 2 radii rows of as many columns.
+    False when no activity is left. work: float64[2, headings + 1, room for a layer], the last
+    layer zero; padded: float64[2, room for a layer]. A layer takes n + 2 radii rows of as many
+    columns.
     """
     layers = cells.shape[0]
     n = cells.shape[1]
@@ -220,11 +264,12 @@ def iterate(
         height, width = grown_height, grown_width
         rows = _torus_places(top - out_radius, height + 2 * out_radius, n)
         columns = _torus_places(left - out_radius, width + 2 * out_radius, n)
+        window = _torus_window(rows, columns, n)
         stride = columns.shape[0]
         size = height * stride
         for k in range(layers):
             if alive[k]:
-                _blur_layer(blurred[k], flat[k], n, rows, columns, excite, padded)
+                _blur_layer(blurred[k], flat[k], window, stride, excite, padded)
         raised = _dilate(alive, layers, out_radius)
         for k in range(layers):
             if raised[k]:
@@ -246,19 +291,18 @@ def iterate(
         for k in range(layers):
             if kept[k] and not raised[k]:
                 excited[k, :size] = 0.0
-        inner_rows = _box_places(low_row - in_radius, high_row - low_row + 2 * in_radius, height, n)
-        inner_columns = _box_places(
-            low_column - in_radius, high_column - low_column + 2 * in_radius, width, n
-        )
+        low_row -= in_radius
+        low_column -= in_radius
+        inner_height = high_row - low_row + in_radius
+        inner_width = high_column - low_column + in_radius
         total = _inhibit(
             excited,
             blurred,
             raised,
             kept,
             size,
-            stride,
-            inner_rows,
-            inner_columns,
+            _box_window(low_row, inner_height, low_column, inner_width, height, width, stride, n),
+            inner_width,
             inhibit,
             global_inhibition,
             padded,
@@ -271,9 +315,9 @@ def iterate(
             occupied,
             blurred,
             kept,
-            _torus_places(top + low_row, high_row - low_row, n),
-            _torus_places(left + low_column, high_column - low_column, n),
-            inner_columns.shape[0],
+            _torus_places(top + low_row + in_radius, inner_height - 2 * in_radius, n),
+            _torus_places(left + low_column + in_radius, inner_width - 2 * in_radius, n),
+            inner_width,
             1.0 / total,
             step,
             spin,
@@ -321,33 +365,31 @@ def _inhibit(
     raised: Bytes,
     kept: Bytes,
     size: int,
-    stride: int,
-    rows: Ints,
-    columns: Ints,
+    window: Places,
+    stride_out: int,
     weights: Floats,
     global_inhibition: float,
     padded: Floats,
 ) -> float:
     """What inhibition leaves of the kept layers within a box, and its sum.
 
-    rows, columns: the box and a radius around it, as places in `excited`. Row j of a layer of the
-    result starts at j * len(columns).
+    window: the box and a radius around it, `stride_out` wide, as places in `excited`. Row j of a
+    layer of the result starts at j * stride_out.
     """
     radius = weights.shape[0] - 1
-    m = columns.shape[0]
-    height, width = rows.shape[0] - 2 * radius, m - 2 * radius
-    first_column = columns[radius]
+    height = window.shape[0] // stride_out - 2 * radius
+    width = stride_out - 2 * radius
     sums = np.zeros(width)
-    line = np.empty(size)
+    line = np.zeros(size + 1)
     for k in range(kept.shape[0]):
         if not kept[k]:
             continue
-        _blur_heading(line, excited, raised, k, weights)
-        _blur_layer(result[k], line, stride, rows, columns, weights, padded)
+        _blur_heading(line[:size], excited, raised, k, weights)
+        _blur_layer(result[k], line, window, stride_out, weights, padded)
         for j in range(height):
-            start = rows[j + radius] * stride + first_column
+            start = int(window[(j + radius) * stride_out + radius])
             here = excited[k, start : start + width]
-            lost = result[k, j * m : j * m + width]
+            lost = result[k, j * stride_out : j * stride_out + width]
             for x in range(width):
                 value = here[x] - lost[x]
                 value = value - global_inhibition if value >= global_inhibition else 0.0
@@ -386,6 +428,7 @@ def integrate(
     low = math.floor(turns)
     high = math.ceil(turns)
     far = turns - (high - 1) if spin != 0.0 else 0.0
+    reached = np.zeros(columns.shape[0], dtype=np.uint8)
     for k in range(layers):
         if not kept[k]:
             continue
@@ -415,6 +458,7 @@ def integrate(
         first = (k + sign * low) % layers
         second = (k + sign * high) % layers
         for y in range(rows.shape[0]):
+            any_here = False
             j = rows[y]
             j_up = _wrapped(j + up_j, n)
             j_right = _wrapped(j + right_j, n)
@@ -435,10 +479,8 @@ def integrate(
                         kept_up = 0.0
                     if j == n - 1 - corner_j and i == n - 1 - corner_i:
                         kept_right = 0.0
-                for j_reached in (j, j_up, j_right, j_both):
-                    occupied[ROW, j_reached] = 1
-                for i_reached in (i, i_up, i_right, i_both):
-                    occupied[COLUMN, i_reached] = 1
+                any_here = True
+                reached[x] = 1
                 for part in range(2):
                     weight = (1.0 - far if part == 0 else far) * value
                     if weight == 0.0:
@@ -449,6 +491,13 @@ def integrate(
                     cells[layer, j_up, i_up] += weight * to_up * kept_up
                     cells[layer, j_right, i_right] += weight * to_right * kept_right
                     cells[layer, j_both, i_both] += weight * both
+            if any_here:
+                for j_reached in (j, j_up, j_right, j_both):
+                    occupied[ROW, j_reached] = 1
+    for x in range(columns.shape[0]):
+        if reached[x]:
+            for aside in range(-1, 2):
+                occupied[COLUMN, _wrapped(columns[x] + aside, n)] = 1
 
 
 @compiled
@@ -485,13 +534,18 @@ def read_out(
         k = _wrapped(at_k + dk, layers)
         if not occupied[HEADING, k]:
             continue
+        layer_sum = 0.0
         for dj in range(-half, half + 1):
             j = _wrapped(at_j + dj, n)
+            row_sum = 0.0
             for di in range(-half, half + 1):
                 i = _wrapped(at_i + di, n)
-                sum_x[i] += cells[k, j, i]
-                sum_y[j] += cells[k, j, i]
-                sum_th[k] += cells[k, j, i]
+                value = cells[k, j, i]
+                sum_x[i] += value
+                row_sum += value
+            sum_y[j] += row_sum
+            layer_sum += row_sum
+        sum_th[k] += layer_sum
     best[0] = _population_vector(sum_x, circle_xy, faithful)
     best[1] = _population_vector(sum_y, circle_xy, faithful)
     best[2] = _population_vector(sum_th, circle_th, faithful)

@@ -72,7 +72,7 @@ class PoseCells:
         self._excite = half_gaussian(c.pc_w_e_dim, c.pc_w_e_var)
         self._inhibit = half_gaussian(c.pc_w_i_dim, c.pc_w_i_var)
         room = (n + 2 * (max(c.pc_w_e_dim, c.pc_w_i_dim) // 2)) ** 2
-        self._work = np.zeros((2, t, room), dtype=np.float64)
+        self._work = np.zeros((2, t + 1, room), dtype=np.float64)
         self._padded = np.zeros((2, room), dtype=np.float64)
         self._angles_xy = unit_circle(n)
         self._angles_th = unit_circle(t)

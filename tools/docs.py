@@ -18,7 +18,7 @@ from pydantic.fields import FieldInfo
 
 from vibrissa.messages.topics import TOPICS
 from vibrissa.processes.config import Experiment
-from vibrissa.processes.table import PROCESSES, listeners, producers
+from vibrissa.processes.table import PROCESSES, SLOTS, listeners, producers
 
 DOCS: Final = Path(__file__).resolve().parent.parent / "docs"
 _PART: Final = re.compile(r"(<!-- generated: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -33,7 +33,7 @@ def topics() -> str:
                 f"`{topic.name}`",
                 f"{topic.type.__name__} v{topic.type.version}",
                 f"{topic.rate:g}" if topic.rate else "now and then",
-                "every host" if topic.producer == "any" else ", ".join(producers(topic.name)),
+                "every host" if topic.producer == "any" else _speakers(topic.name),
                 ", ".join(listeners(topic.name)) or "-",
                 _yes(topic.recorded),
                 _yes(topic.compared),
@@ -46,7 +46,7 @@ def topics() -> str:
 def processes() -> str:
     """The process table."""
     return _markdown(
-        ("process", "node", "hears", "says", "paced by", "priority", "reflex", "stand-in"),
+        ("process", "node", "hears", "says", "paced by", "priority", "cores", "stand-in"),
         (
             (
                 f"`{row.name}`",
@@ -55,7 +55,7 @@ def processes() -> str:
                 _names(row.says),
                 row.pacing,
                 str(row.priority or "-"),
-                _yes(row.reflex),
+                row.cores,
                 _yes(row.source),
             )
             for row in PROCESSES.values()
@@ -122,6 +122,12 @@ def _key(name: str, info: FieldInfo) -> tuple[str, ...]:
 def _markdown(columns: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
     lines = [columns, tuple("---" for _ in columns), *rows]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def _speakers(topic: str) -> str:
+    found = producers(topic)
+    named = [name for name in found if name not in SLOTS]
+    return ", ".join([*named, "slots"] if len(named) < len(found) else named)
 
 
 def _names(topics: tuple[str, ...]) -> str:

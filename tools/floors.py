@@ -81,7 +81,7 @@ def _result(role: str, folder: str, set_up: str) -> dict[str, Any]:
 
 def _prepare(set_up: str) -> None:
     if set_up != SET_UPS[0]:
-        realtime.prepare(PRIORITY, reflex=True)
+        realtime.prepare(PRIORITY, "reflex")
 
 
 def _sockets(folder: str, mine: str, other: str, set_up: str) -> tuple[Any, Any]:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
+from typing import Final
+
 from cantools.database.can import Bus, Database, Message, Node, Signal
 from cantools.database.can.formats.dbc import DbcSpecifics
+from cantools.database.can.formats.dbc.dbc_attribute_definition import DbcAttributeDefinition
 from cantools.database.conversion import BaseConversion
 
 from vibrissa.messages.types import WHISKERS
@@ -19,6 +23,15 @@ from vibrissa.rig.devices.can_layout import (
     SAMPLE_BYTES,
 )
 from vibrissa.rig.devices.protocol import PROTOCOL, THETA, Channel, Hello
+
+FRAME_FORMAT: Final = DbcAttributeDefinition[str](
+    "VFrameFormat",
+    default_value="StandardCAN",
+    kind="BO_",
+    type_name="ENUM",
+    choices=["StandardCAN", "ExtendedCAN", *("reserved",) * 12, "StandardCAN_FD"],
+)
+"""How a database says that a message is an FD frame."""
 
 
 def database(hello: Hello) -> Database:
@@ -45,9 +58,8 @@ def database(hello: Hello) -> Database:
     ]
     nodes = [Node(name) for name in ("host", "head")]
     bus = Bus("head", baudrate=BITRATE, fd_baudrate=DATA_BITRATE)
-    # The writer says that the frames are FD only where there are attributes at all.
-    specifics = DbcSpecifics(attribute_definitions={})
-    return Database(messages, nodes, [bus], str(PROTOCOL), specifics, strict=True)
+    specifics = DbcSpecifics(attribute_definitions=OrderedDict({FRAME_FORMAT.name: FRAME_FORMAT}))
+    return Database(messages, nodes, [bus], str(PROTOCOL), specifics)
 
 
 def _unit(channel: Channel) -> str:

@@ -87,9 +87,11 @@ class Run:
 
 Event = Sample | Command | Failure | Route | Register | Forget | Request | Rollback | Run
 
-IDS = st.sampled_from([OLD, OLD, NEW, NEW, THIRD, STRANGER, RETRACT, FORGED])
+TRIO = st.sampled_from([OLD, NEW, THIRD])
+IDS = st.one_of(TRIO, TRIO, TRIO, st.sampled_from([STRANGER, RETRACT, FORGED]))
 OFFSETS = st.one_of(
-    *[st.floats(-0.03125, 0.03125, width=32)] * 8, st.sampled_from([np.nan, -np.inf, -3.0, 3.0, 1e30])
+    *[st.floats(-0.03125, 0.03125, width=32)] * 8,
+    st.sampled_from([np.nan, -np.inf, -3.0, 3.0, 1e30]),
 )
 COMMANDS = st.builds(
     Command,
@@ -103,30 +105,37 @@ RUNS = st.builds(
     Run,
     st.integers(1, FRESH + 2),
     st.permutations([OLD, NEW, THIRD]).map(tuple),
-    st.sampled_from([0.0, 0.001, -0.001, 0.004]),
+    st.sampled_from([0.0, 0.001, -0.001, 0.004, 0.03]),
 )
-REQUESTS = st.builds(
-    Request,
-    IDS,
-    st.sampled_from([None, None, None, 1, 3, 6, 0, -2]),
-    st.sampled_from([0, 0, 1, 3, 50, -1, 2001]),
+LEADS = st.sampled_from([None, None, None, 1, 3, 6, 0, -2])
+BLENDS = st.sampled_from([0, 0, 1, 3, 50, -1, 2001])
+WILD = st.one_of(
+    st.builds(Sample, st.sampled_from([0] * 9 + [3])),
+    COMMANDS,
+    COMMANDS,
+    RUNS,
+    st.builds(Request, IDS, LEADS, BLENDS),
+    st.just(Rollback()),
+    st.builds(Failure, IDS),
+    st.builds(Route, st.sampled_from([OLD, NEW, THIRD, RETRACT])),
+    st.builds(Register, IDS),
+    st.builds(Forget, IDS),
 )
-LISTS = st.lists(
-    st.one_of(
-        st.builds(Sample, st.sampled_from([0] * 9 + [3])),
-        COMMANDS,
-        COMMANDS,
-        RUNS,
-        RUNS,
-        REQUESTS,
-        REQUESTS,
-        st.just(Rollback()),
-        st.builds(Failure, IDS),
-        st.builds(Route, st.sampled_from([OLD, NEW, THIRD, RETRACT])),
-        st.builds(Register, IDS),
-        st.builds(Forget, IDS),
-    ),
-    max_size=60,
+READY = st.builds(
+    Run,
+    st.just(FRESH),
+    st.permutations([OLD, NEW, THIRD]).map(tuple),
+    st.sampled_from([0.001, 0.001, 0.001, 0.03]),
+)
+SPOILED = st.tuples(st.just(Sample()), COMMANDS)
+SWAPS = st.tuples(
+    READY.map(lambda run: (run,)),
+    st.one_of(st.just(()), st.just(()), SPOILED),
+    st.one_of(st.builds(Request, TRIO, LEADS, BLENDS), st.just(Rollback())).map(lambda e: (e,)),
+    st.tuples(st.one_of(RUNS, RUNS, WILD), RUNS),
+).map(lambda parts: [event for part in parts for event in part])
+LISTS = st.lists(st.one_of(st.lists(WILD, max_size=6), SWAPS, SWAPS), min_size=4, max_size=12).map(
+    lambda parts: [event for part in parts for event in part]
 )
 
 
@@ -198,7 +207,7 @@ class World:
         self.misses = 0
         self.by_order = True
         self.blend: tuple[NDArray[np.float32], int, int] = (self.held, 0, 0)
-        for event in (Register(OLD), Register(NEW), Route(OLD)):
+        for event in (Register(OLD), Register(NEW), Register(THIRD), Route(OLD)):
             self.do(event)
 
     def do(self, event: Event) -> None:
@@ -507,10 +516,7 @@ def test_no_flood_of_shadows_or_strangers_changes_what_the_drives_get(
     def others(event: Event) -> bool:
         return THIRD not in (getattr(event, "controller", None), *getattr(event, "controllers", ()))
 
-    plain = World()
-    flooded = World()
-    for world in (plain, flooded):
-        world.do(Register(THIRD))
+    plain, flooded = World(), World()
     pending = list(flood)
     for event in filter(others, events):
         plain.do(event)
