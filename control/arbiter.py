@@ -86,7 +86,7 @@ class Arbiter:
     slew_limit    rad per tick, largest change of what the drives get, whoever commands it
     max_misses    held ticks in a row that end a controller's rule (20 ticks = 10 ms), and the ticks
                   within which the slew limit must bring the drives to where a newcomer wants them
-    fresh_ticks   answers on time in a row that a newcomer must have given in shadow
+    fresh_ticks   samples of which a newcomer in shadow must have answered nine in ten on time
     retract_speed rad per tick, of the built-in retract controller, at most slew_limit
     last_command  float32[18] rad, what the drives hold at the start
 
@@ -125,11 +125,11 @@ class Arbiter:
         self._records: dict[ControllerId, Shadow] = {}
         self._told: list[ControllerId] = []  # strangers whose refusal is a decision already
         self._strangers = 0
-        self._built_in = self._owner = Shadow()
+        self._built_in = self._owner = Shadow(fresh_ticks)
         self._retract = Retract(retract_speed)
         last = self._drives.last
         self._retract.activate(NO_TICK, last, last)
-        Shadow().note(1, 0, 0, last, self._drives.travel, self._owner)  # compiles
+        Shadow(fresh_ticks).note(1, 0, 0, last, self._drives.travel, self._owner)  # compiles
 
     @property
     def last_command(self) -> Float32s:
@@ -145,7 +145,7 @@ class Arbiter:
         """Open `tick`; the previous tick, if nothing answered it, is now held.
 
         A switch armed for this tick, or for one that got no sample, happens now unless the newcomer
-        has become unfit. Returns the retract command when the built-in controller is or becomes
+        has lapsed or moved too far. Returns the retract command when the built-in controller is or becomes
         active, else no command: the active controller is to answer. Ticks without a sample, between
         the previous and this one, are held and count as nobody's miss. Raises ArbiterError when
         ticks do not increase.
@@ -230,7 +230,7 @@ class Arbiter:
         if len(self._records) >= MOST_CONTROLLERS:
             cause = f"full: {MOST_CONTROLLERS} controllers are registered, forget one first"
             return self._refused(controller, cause)
-        self._records[controller] = Shadow()
+        self._records[controller] = Shadow(self._fresh_ticks)
         self._told.clear()
         return Decision(self._tick, "registered", controller, "in shadow")
 
@@ -253,10 +253,11 @@ class Arbiter:
 
         Refused, in this order: built in, unknown, already switching, in the past, blend (not within
         [0, LONGEST_BLEND]), active already, retracting (by order; a fallback can be ended so), not
-        finite / out of range / wrong length (a command less than `fresh_ticks` answers ago), stale
-        (neither this tick nor the previous one answered), not ready (too few answers in a row),
-        jump too large (from the last command to the newcomer's last one, beyond what the slew limit
-        allows in `max_misses` or, if that is longer, `blend_ticks` ticks).
+        finite / out of range / wrong length (a command in the last `fresh_ticks` samples), stale
+        (no fresh answer for LAPSE samples), not ready (more than one in TOLERANCE of the last
+        `fresh_ticks` samples without a fresh answer), jump too large (from the last command to the
+        newcomer's last one, beyond what the slew limit allows in `max_misses` or, if that is
+        longer, `blend_ticks` ticks).
         """
         at = tick + LEAD if at is None else at
         cause = ""
@@ -306,7 +307,7 @@ class Arbiter:
     def _switch(self, armed: Armed) -> Decision:
         controller, _, blend_ticks = armed
         self.armed = None
-        cause = self._objection(controller, blend_ticks, "went stale before its tick: ")
+        cause = self._objection(controller, blend_ticks, due=True)
         if cause:
             return self._refused(controller, cause)
         before = self.active
@@ -318,16 +319,17 @@ class Arbiter:
             self.previous = None
         return Decision(self._tick, "switched", controller, f"after {before}")
 
-    def _objection(self, controller: ControllerId, blend_ticks: int, prefix: str = "") -> str:
+    def _objection(self, controller: ControllerId, blend_ticks: int, *, due: bool = False) -> str:
         """Why a registered `controller` can't take over now; empty when it can."""
         if controller == self.active:
             return "active already: it has the drives"
         if self.active == RETRACT and not self._fallen:
             return "retracting: by order, no controller has the drives"
         record = self._records[controller]
-        cause = record.unfit(self._sample, self._fresh_ticks)
-        if cause:
-            return prefix + cause
+        if due and (cause := record.lapsed(self._sample)):
+            return f"went stale before its tick: {cause}"
+        if not due and (cause := record.unfit(self._sample)):
+            return cause
         limit = self._drives.slew_limit * max(self._max_misses, blend_ticks)
         jump, i = self._drives.jump(record.command)
         if jump > limit:

@@ -20,6 +20,10 @@ from vibrissa.control.kinematics import WHISKERS, Float32s, Float64s
 from vibrissa.numerics import compiled
 
 LARGEST, SUM = 0, 1  # of the divergence figures, rad
+LAPSE = 10
+"""Samples after which a controller without a fresh answer is stale."""
+TOLERANCE = 10
+"""One in so many samples may go unanswered while a controller gets ready."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,8 +69,15 @@ def _note(
     return check_command(command, travel)
 
 
+def _broken(violation: Violation) -> str:
+    return f"{REASONS[violation.reason]}: {violation}, at tick {violation.tick}"
+
+
 class Shadow:
-    """The record of one controller, active or in shadow."""
+    """The record of one controller, active or in shadow.
+
+    need: how many samples tell whether it is ready.
+    """
 
     __slots__ = (
         "_compared",
@@ -74,22 +85,30 @@ class Shadow:
         "_heard",
         "_last_tick",
         "_late",
+        "_need",
         "_on_time",
+        "_sound",
         "_streak",
         "_unasked",
+        "_violated",
         "_violation",
         "_violations",
+        "_window",
         "rows",
     )
 
-    def __init__(self) -> None:
+    def __init__(self, need: int) -> None:
         self.rows = (np.zeros(WHISKERS, np.float32), np.zeros(WHISKERS, np.float32))
         """float32[18] rad each: the answers to samples of even and of odd number."""
         self._heard = 0  # the last sample answered on time, soundly or not
         self._streak = 0  # the fresh answers in a row that end with it
+        self._sound = 0  # the last sample with a fresh answer
+        self._need = need
+        self._window = 0  # a bit for each of `need` samples up to the last heard: 1 for fresh
         self._last_tick = NO_TICK
         self._on_time = self._late = self._unasked = self._violations = 0
-        self._violation: Violation | None = None  # what broke the last stretch, if a command did
+        self._violated = 0  # the last sample with an answer that no drive may get ...
+        self._violation: Violation | None = None  # ... and what was wrong with it
         self._figures = np.zeros(2, np.float64)
         self._compared = 0
 
@@ -102,20 +121,37 @@ class Shadow:
         """Whether `sample` lies in the current stretch of fresh answers."""
         return self._heard - self._streak < sample <= self._heard
 
-    def unfit(self, sample: int, need: int) -> str:
-        """Why this controller can't take over in `sample`; empty when it can.
+    def unfit(self, sample: int) -> str:
+        """Why this controller can't be armed in `sample`; empty when it can.
 
-        It can when it has answered `need` samples in a row, up to this or to the previous one.
+        It can when of the last `need` samples (the present one counts once it is answered) all but
+        one in TOLERANCE got a fresh answer, none of them before an answer that no drive may get.
         """
-        if self._violation is not None and self._streak < need:
-            v = self._violation
-            since = f"at tick {v.tick}, {self._streak} fresh answers since, expected {need}"
-            return f"{REASONS[v.reason]}: {v}, {since}"
-        if self._streak > 0 and self._heard < sample - 1:
-            return f"stale: last fresh answer to tick {self._last_tick}"
-        if self._streak < need:
-            return f"not ready: {self._streak} fresh answers in a row, expected {need}"
-        return ""
+        end = sample if self._heard == sample else sample - 1
+        behind = min(end - self._heard, self._need)
+        fresh = (self._window << behind & (1 << self._need) - 1).bit_count()
+        expected = self._need - self._need // TOLERANCE
+        if fresh >= expected:
+            return self.lapsed(sample)
+        count = f"{fresh} fresh answers to {self._need} samples, expected {expected}"
+        if self._violation is not None and end - self._violated < self._need:
+            return f"{_broken(self._violation)}, since then {count}"
+        if 0 < self._sound < sample - LAPSE:
+            return self._stale()
+        return f"not ready: {count}"
+
+    def lapsed(self, sample: int) -> str:
+        """Why this controller, once armed, can't take over in `sample`; empty when it can.
+
+        It can when within the last LAPSE samples it gave a fresh answer and none that no drive may
+        get: one that was ready is not given up for a few late answers.
+        """
+        if self._violation is not None and self._violated >= sample - LAPSE:
+            return _broken(self._violation)
+        return "" if self._sound >= sample - LAPSE else self._stale()
+
+    def _stale(self) -> str:
+        return f"stale: no fresh answer for {LAPSE} ticks, last answer to tick {self._last_tick}"
 
     def note(
         self,
@@ -160,12 +196,13 @@ class Shadow:
         """A sound answer to `sample` came on time."""
         if self._heard == sample:
             return
-        if self._heard == sample - 1:
-            self._streak += 1
-        else:
-            self.interrupted()
-            self._streak = 1
-        self._heard = sample
+        after = sample - self._heard
+        if after > 1:
+            self._streak = 0
+            self.compare_anew()
+        self._streak += 1
+        self._window = (self._window << min(after, self._need) | 1) & (1 << self._need) - 1
+        self._heard = self._sound = sample
         self._last_tick = tick
         self._on_time += 1
 
@@ -173,15 +210,14 @@ class Shadow:
         """An answer to `sample` came on time that no drive may get."""
         self.interrupted()
         self._violation = violation
-        self._heard = sample
+        self._heard = self._violated = sample
         self._last_tick = violation.tick
         self._on_time += 1
         self._violations += 1
 
     def interrupted(self) -> None:
-        """The stretch of fresh answers is over; the next answer begins another."""
-        self._streak = 0
-        self._violation = None
+        """No answer so far counts any more."""
+        self._streak = self._window = self._sound = 0
         self.compare_anew()
 
     def compare_anew(self) -> None:

@@ -256,7 +256,10 @@ def topic_of(frame: bytes) -> str:
 
 def decode(frame: bytes) -> Message:
     """Unframe a message of any topic. Raises DecodeError."""
-    return CODECS[topic_of(frame)].decode(frame)
+    decoder = _DECODERS.get(frame[: frame.find(b"\0") + 1])
+    if decoder is None or len(frame) > MAX_FRAME_BYTES:
+        decoder = CODECS[topic_of(frame)].decode
+    return decoder(frame)
 
 
 def encode(message: Message) -> bytes:
@@ -282,3 +285,6 @@ def epoch_of(frame: bytes, topic: str, source: str) -> int:
     if len(frame) > at and frame[start] & 0xF0 == 0x90 and len(source) < 32 and frame[at] < 0x80:
         return frame[at]
     return header(frame)[2]
+
+
+_DECODERS: Final[dict[bytes, Decode]] = {c.prefix: c.decode for c in CODECS.values()}

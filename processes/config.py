@@ -84,7 +84,7 @@ class Arm(Section):
     sequence: Annotated[
         str, Field(pattern="^[CA]{1,100}$", description="C clockwise, A anticlockwise circuits")
     ] = "CCCAAACACA"
-    speed: Annotated[float, Field(gt=0, le=0.5, description="m/s")] = 0.04
+    speed: Annotated[float, Field(gt=0, le=0.25, description="m/s")] = 0.04
     lift: Annotated[
         float, Field(ge=0, le=0.3, description="m above the working height while calibrating")
     ] = 0.1
@@ -209,7 +209,10 @@ def load_experiment(
     except ValidationError as error:
         raise RunError(f"{where}: " + "; ".join(_complaints(error))) from None
     if not experiment.maze.text:
-        text = _maze_text(experiment.maze.file, path.parent if path else Path())
+        try:
+            text = _maze_text(experiment.maze.file, path.parent if path else Path())
+        except RunError as error:
+            raise RunError(f"{where}: {error}") from None
         maze = experiment.maze.model_copy(update={"text": text})
         experiment = experiment.model_copy(update={"maze": maze})
     _check_parts(experiment, where)

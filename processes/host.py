@@ -37,6 +37,9 @@ HOUSEKEEPING_NS: Final = 50_000_000
 """How often receipts are handed in, so that a crash costs few."""
 BUNDLE_NS: Final = 10_000_000
 """How often bundled listeners are served: what a crash of this process may take from the log."""
+HEEDED: Final = ("run.event", "run.order")
+LONGEST_WAIT: Final = 8
+"""Steps that may wait to be accounted for."""
 RECEIPT_BATCH: Final = 400
 DRAIN_S: Final = 0.005
 PARTING_TICKS: Final = 600
@@ -94,7 +97,9 @@ class Host:
             layout.connections(name),
             bundled=layout.bundled(name),
         )
-        self.steppers = {n: Stepper(n, build(n, experiment)) for n in self.nodes}
+        self.steppers = {
+            n: Stepper(n, build(n, experiment), publish=self._publish) for n in self.nodes
+        }
         self.seats = {row.name: Seat(row) for row in rows}
         self.group = Group([(self.steppers[r.name], r.hears) for r in rows], self._stepped)
         self.sent: collections.Counter[str] = collections.Counter()
@@ -109,7 +114,8 @@ class Host:
         self._parent = os.getppid()
         self._leave_at = 0
         self._mark = 0
-        self._outgoing: list[bytes] = []
+        self._said = 0
+        self._unaccounted: list[tuple[Seat, Step, int, int, int]] = []
 
     def run(self) -> None:
         """Barrier, loop, farewell."""
@@ -190,29 +196,46 @@ class Host:
 
     def _feed(self, frame: bytes) -> None:
         self._mark = time.monotonic_ns()
+        self._said = 0
         self.group.feed(frame)
 
+    def _publish(self, frame: bytes) -> None:
+        """Send what a node says the moment it says it."""
+        self.port.publish(frame)
+        if not self._said:
+            self._said = time.monotonic_ns()
+
     def _stepped(self, steps: Steps, frame: bytes, step: Step) -> None:
-        """Publish what a step said, then measure it and write its receipt."""
-        publish = self.port.publish
-        for output in step.outputs:
-            publish(output)
+        """Measure a step and write its receipt.
+
+        A step that others are waiting for is accounted for when their answer is there: until then
+        the core belongs to them.
+        """
         end = time.monotonic_ns()
         start, self._mark = self._mark, end
+        said, self._said = self._said, 0
         seat = self.seats[steps.name]
+        self._unaccounted.append((seat, step, start, said, end))
         topic = step.stream[0]
-        if topic == seat.driver:
-            self.t = step.t
-            seat.clock.tick(self.t0 + step.t, start, end)
-            if step.outputs:
-                seat.probe_went_out(step.t, end)
-        elif topic == seat.answer:
-            seat.probe_came_back(step.t, start)
-        elif topic in ("run.event", "run.order"):
+        if topic in HEEDED:
             self._heed(CODECS[topic].decode(frame).body)
-        seat.book.add(step)
-        if len(seat.book) >= RECEIPT_BATCH:
-            self._publish_own(seat.book.frame(step.t))
+        if not (seat.answer and topic == seat.driver) or len(self._unaccounted) > LONGEST_WAIT:
+            self._account()
+
+    def _account(self) -> None:
+        for seat, step, start, said, end in self._unaccounted:
+            topic = step.stream[0]
+            if topic == seat.driver:
+                self.t = step.t
+                seat.clock.tick(self.t0 + step.t, start, end)
+                if said:
+                    seat.probe_went_out(step.t, said)
+            elif topic == seat.answer:
+                seat.probe_came_back(step.t, start)
+            seat.book.add(step)
+            if len(seat.book) >= RECEIPT_BATCH:
+                self._publish_own(seat.book.frame(step.t))
+        self._unaccounted.clear()
 
     def _heed(self, body: Event | Order) -> None:
         """A stop is for everybody, a close for the slot it names."""
@@ -242,6 +265,7 @@ class Host:
             self._inject("stop", "supervisor gone")
 
     def _flush(self, *, final: bool) -> None:
+        self._account()
         for seat in self.seats.values():
             if len(seat.book):
                 self._publish_own(seat.book.frame(self.t))

@@ -9,10 +9,10 @@ gives outputs their identity and keeps the running digest that receipts are made
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, Protocol
 
-from vibrissa.messages.codec import CODECS, Message, topic_of
+from vibrissa.messages.codec import CODECS, Message, decode
 from vibrissa.messages.types import TICK_NS, TimerTick
 
 Output = tuple[str, Any]
@@ -23,7 +23,11 @@ class Node(Protocol):
     """A step function with its state."""
 
     def step(self, message: Message) -> Iterable[Output]:
-        """Consume one message; return what follows from it, in order."""
+        """Consume one message; give what follows from it, in order, the most urgent first.
+
+        A live host publishes each output as it comes, so a generator that yields what others wait
+        for before it does the rest of its work lets them start at once.
+        """
 
 
 class Step(NamedTuple):
@@ -41,19 +45,35 @@ class Step(NamedTuple):
 class Stepper:
     """Drives one node by frames: decodes, steps, identifies and encodes, keeps the digest."""
 
-    def __init__(self, name: str, node: Node, epoch: int = 0) -> None:
+    def __init__(
+        self,
+        name: str,
+        node: Node,
+        epoch: int = 0,
+        publish: Callable[[bytes], None] | None = None,
+    ) -> None:
         self.name = name
         self.node = node
         self.epoch = epoch
+        self._publish = publish
         self.steps = 0
         self.digest = 0
         self.sent: dict[str, int] = {}
         """topic -> messages said so far"""
 
     def step(self, frame: bytes) -> Step:
-        """Feed one frame. Raises DecodeError or EncodeError before the digest moves."""
-        message = CODECS[topic_of(frame)].decode(frame)
-        outputs = [self._frame(topic, message.t, body) for topic, body in self.node.step(message)]
+        """Feed one frame; publish every output as it comes.
+
+        Raises DecodeError or EncodeError before the digest moves.
+        """
+        message = decode(frame)
+        publish = self._publish
+        outputs = []
+        for topic, body in self.node.step(message):
+            output = self._frame(topic, message.t, body)
+            if publish is not None:
+                publish(output)
+            outputs.append(output)
         digest = zlib.crc32(frame, self.digest)
         for output in outputs:
             digest = zlib.crc32(output, digest)

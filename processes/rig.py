@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -39,7 +40,7 @@ class RigNode:
         self._answers = -1
         self._setpoint: tuple[float, float, float, float] | None = None
 
-    def step(self, message: Message) -> list[Output]:
+    def step(self, message: Message) -> Iterable[Output]:
         body = message.body
         match message.topic:
             case "host.timer":
@@ -49,17 +50,15 @@ class RigNode:
                 self._answers = body.tick
             case "arm.setpoint":
                 self._setpoint = tuple(body.pose.tolist())
-        return []
+        return ()
 
-    def _tick(self, tick: int) -> list[Output]:
-        outputs: list[Output] = []
+    def _tick(self, tick: int) -> Iterator[Output]:
+        theta, x, y = self._head.step(tick, self._arm.pose_at(tick), self._command)
+        self._command = None
+        yield "rig.sample", HeadReading(tick, self._answers, theta, x, y)
         if tick % ARM_PERIOD == 0:
             if tick:
                 pose = np.array(self._arm.pose_at(tick), np.float64)
-                outputs.append(("rig.arm", ArmReading(tick, pose)))
+                yield "rig.arm", ArmReading(tick, pose)
             self._arm.step(tick, self._setpoint)
             self._setpoint = None
-        theta, x, y = self._head.step(tick, self._arm.pose_at(tick), self._command)
-        self._command = None
-        outputs.append(("rig.sample", HeadReading(tick, self._answers, theta, x, y)))
-        return outputs

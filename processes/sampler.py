@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+
 from vibrissa.control.arbiter import NO_TICK, RETRACT, Arbiter, ControllerId, Decision, Routing
 from vibrissa.control.kinematics import paper_head
 from vibrissa.messages.codec import Message
@@ -51,7 +53,7 @@ class SamplerNode:
         self._late = 0
         self._switches = 0
 
-    def step(self, message: Message) -> list[Output]:
+    def step(self, message: Message) -> Iterable[Output]:
         body = message.body
         match message.topic:
             case "rig.sample":
@@ -77,13 +79,8 @@ class SamplerNode:
             "switches": self._switches,
         }
 
-    def _reading(self, reading: HeadReading) -> list[Output]:
+    def _reading(self, reading: HeadReading) -> Iterator[Output]:
         tick = reading.tick
-        outputs: list[Output] = []
-        if tick >= self._retract_tick:
-            outputs += self._start_retracting()
-        self._ticks += 1
-        self._obeyed += reading.answers == tick - 1
         sample = HeadSample(
             tick=tick,
             answers=reading.answers,
@@ -92,11 +89,14 @@ class SamplerNode:
             y=reading.y,
             command=self._arbiter.last_command,
         )
-        outputs.append(("head.sample", sample))
-        outputs += self._routed(tick, self._arbiter.on_sample(tick))
+        yield "head.sample", sample
+        self._ticks += 1
+        self._obeyed += reading.answers == tick - 1
+        if tick >= self._retract_tick:
+            yield from self._start_retracting()
+        yield from self._routed(tick, self._arbiter.on_sample(tick))
         if (tick + 1) % TICK_HZ == 0:
-            outputs += self._shadows(tick)
-        return outputs
+            yield from self._shadows(tick)
 
     def _command(self, source: str, epoch: int, command: WhiskCommand) -> list[Output]:
         controller = ControllerId(source, epoch)

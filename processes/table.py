@@ -22,7 +22,7 @@ Pacing = Literal["timer", "arrival", "drain"]
 class Process:
     """One row: a node, what it hears, what it says, and how it is hosted.
 
-    priority is SCHED_FIFO's, 0 for the ordinary scheduler. `source` marks a stand-in for hardware:
+    priority is SCHED_FIFO's, 0 for the ordinary scheduler; who is waited for goes first. `source` marks a stand-in for hardware:
     what-if re-runs take its messages from the log instead of stepping it. `silence` is how many
     seconds without a sign of life end the run. The first topic it hears drives it; from the end of
     that step to the arrival of the topic `answer` with the same t is its reaction latency.
@@ -65,7 +65,7 @@ PROCESSES: Final[dict[str, Process]] = {
                 "node.event",
             ),
             pacing="arrival",
-            priority=48,
+            priority=46,
             cores="reflex",
             answer="whisk.command",
         ),
@@ -81,7 +81,7 @@ PROCESSES: Final[dict[str, Process]] = {
                 "node.event",
             ),
             pacing="arrival",
-            priority=46,
+            priority=48,
             cores="reflex",
         ),
         Process(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -64,7 +65,7 @@ class WhiskNode:
         self._protraction = np.zeros(WHISKERS, np.float32)
         self._cycles = 0
 
-    def step(self, message: Message) -> list[Output]:
+    def step(self, message: Message) -> Iterable[Output]:
         match message.topic:
             case "head.sample":
                 return [] if self._controller is None else self._answer(message.body)
@@ -80,11 +81,10 @@ class WhiskNode:
         """Whisk cycles completed as the owner of the drives."""
         return {"cycles": self._cycles}
 
-    def _answer(self, sample: HeadSample) -> list[Output]:
+    def _answer(self, sample: HeadSample) -> Iterator[Output]:
         controller = self._controller
         assert controller is not None
         tick = sample.tick
-        outputs: list[Output] = []
         if self._change is not None and tick >= self._change.tick:
             self._own(self._change.controller == self.name)
         if not self._awake:
@@ -92,23 +92,22 @@ class WhiskNode:
             self._cycle_start = tick
             controller.activate(tick, sample.command, sample.theta)
             self._command = sample.command
-        if self._calibrator is not None:
-            off = np.abs(sample.command - self._command).max()
-            self._disturbed |= bool(off > DISTURBANCE)
+        before = self._command
         command = self._command = controller.step(tick, sample.theta, sample.x, sample.y)
-        outputs.append(("whisk.command", WhiskCommand(tick, command)))
+        yield "whisk.command", WhiskCommand(tick, command)
         np.maximum(self._protraction, command, out=self._protraction)
         calibrating = self._calibrator is not None
         if self._calibrator is not None:
-            outputs += self._calibrate(self._calibrator, sample)
+            off = np.abs(sample.command - before).max()
+            self._disturbed |= bool(off > DISTURBANCE)
+            yield from self._calibrate(self._calibrator, sample)
         if (tick + 1) % self._period == 0:
             cycle = self._cycle(tick, calibrating)
             if self._owner:
                 self._cycles += 1
-                outputs.append(("whisk.cycle", cycle))
+                yield "whisk.cycle", cycle
             if self._disturbed:
-                outputs += self._start_over(tick)
-        return outputs
+                yield from self._start_over(tick)
 
     def _own(self, owner: bool) -> None:
         """Become or cease to be the owner; whoever gains the drives starts from what they hold."""
