@@ -145,10 +145,10 @@ class Arbiter:
         """Open `tick`; the previous tick, if nothing answered it, is now held.
 
         A switch armed for this tick, or for one that got no sample, happens now unless the newcomer
-        has lapsed or moved too far. Returns the retract command when the built-in controller is or becomes
-        active, else no command: the active controller is to answer. Ticks without a sample, between
-        the previous and this one, are held and count as nobody's miss. Raises ArbiterError when
-        ticks do not increase.
+        has lapsed or moved too far. Returns the retract command when the built-in controller is or
+        becomes active, else no command: the active controller is to answer. Ticks without a sample,
+        between the previous and this one, are held and count as nobody's miss. Raises ArbiterError
+        when ticks do not increase.
         """
         if tick <= self._tick:
             raise ArbiterError(f"sample of tick {tick} after tick {self._tick}, expected a later")

@@ -275,6 +275,24 @@ def header(frame: bytes) -> tuple[str, str, int, int, int]:
     return codec.topic, source, epoch, seq, t
 
 
+def stream_of(frame: bytes) -> tuple[bytes, int]:
+    """(what all frames of a stream begin with, seq), without a look at anything else.
+
+    Two streams never begin alike. Raises DecodeError when not even the header can be read.
+    """
+    start = frame.find(b"\0") + 1  # array, version, fixstr and its characters, epoch, seq
+    if len(frame) > start + 3:
+        end = start + 4 + (frame[start + 2] & 0x1F)
+        if len(frame) > end + 5 and frame[start + 2] & 0xE0 == 0xA0 and frame[end - 1] < 0x80:
+            first = frame[end]
+            if first < 0x80:
+                return frame[:end], first
+            if 0xCC <= first <= 0xCE:
+                return frame[:end], int.from_bytes(frame[end + 1 : end + 1 + (1 << first - 0xCC)])
+    topic, source, epoch, seq, _ = header(frame)
+    return f"{topic}\0   {source}{chr(epoch % 128)}".encode(), seq
+
+
 def epoch_of(frame: bytes, topic: str, source: str) -> int:
     """The epoch of a frame whose topic and source are known. Raises DecodeError.
 

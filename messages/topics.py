@@ -32,6 +32,7 @@ _ROWS: Final = (
     Topic("whisk.command", types.WhiskCommand, 2000, "whisk"),
     Topic("whisk.cycle", types.WhiskCycle, 1, "whisk"),
     Topic("whisk.calibration", types.WhiskCalibration, 0, "whisk"),
+    Topic("whisk.failure", types.Event, 0, "whisk"),
     Topic("arm.state", types.ArmState, 125, "arm"),
     Topic("arm.setpoint", types.ArmSetpoint, 125, "arm"),
     Topic("slam.view", types.SlamView, 1, "slam"),

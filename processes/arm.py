@@ -42,6 +42,7 @@ class ArmNode:
     def __init__(self, experiment: Experiment) -> None:
         self._path = make_path(experiment)
         self._started = False
+        self._ended = False
         self._departure: int | None = None
         self._setpoint = np.array(self._path.pose(0), np.float64)
 
@@ -52,9 +53,9 @@ class ArmNode:
             case "whisk.calibration" if self._started and self._departure is None:
                 self._departure = message.t + TICK_NS
             case "run.event" if message.body.kind == "start":
-                self._started = True
+                self._started = not self._ended
             case "run.event" | "host.event" if message.body.kind in ("retract", "stop"):
-                self._started = False
+                self._started, self._ended = False, True
         return []
 
     def _cycle(self, reading: ArmReading) -> list[Output]:

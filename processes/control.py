@@ -1,9 +1,9 @@
 """The control channel between supervisor and processes: a few small, checked messages.
 
-A process says hello, ready, beat, fault, bye; the supervisor says go, finish, leave. Clients (the
-command line, scripts) ask and are answered. Every message
-is a msgpack map {"kind": ..., ...}. Nothing that changes what a node computes travels here: that
-goes over `run.event`, where it is recorded.
+A process says hello, ready, beat, refused, fault, bye; the supervisor says go, finish, leave.
+Clients (the command line, scripts) ask and are answered. Every message is a msgpack map
+{"kind": ..., ...}. Nothing that changes what a node computes travels here: that goes over
+`run.event`, where it is recorded.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ _FIELDS: dict[str, dict[str, type]] = {
     "ready": {},
     "beat": {"t": int, "steps": int, "done": bool},
     "fault": {"cause": str},
+    "refused": {"source": str, "count": int, "cause": str},
     "bye": {"sent": dict, "stats": dict, "cpu_s": float, "counters": dict},
     "go": {"t0_ns": int},
     "finish": {"sent": dict, "cause": str, "died": str},

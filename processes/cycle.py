@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 
 from vibrissa.control.calibration import Calibration, Calibrator
 from vibrissa.control.controller import LAST, Controller, LawController, slewed
+from vibrissa.control.drives import ADMITTED, check_command
 from vibrissa.control.kinematics import WHISKERS
 from vibrissa.control.open_loop import OpenLoop, open_loop_command
 from vibrissa.control.rcp import Rcp, rcp_command
 from vibrissa.control.retract import Retract, retract_command
-from vibrissa.control.shadow import ADMITTED, check_command
 from vibrissa.control.social import Social, social_command
 from vibrissa.messages.types import TICK_NS
 from vibrissa.numerics import compiled
@@ -36,7 +36,7 @@ from vibrissa.processes.controllers import make_controller
 from vibrissa.processes.results import RunError
 from vibrissa.processes.rig import head_params
 from vibrissa.processes.whisk import DISTURBANCE, MOST_ATTEMPTS
-from vibrissa.rig.head import COMMAND_NOT_FINITE, GAMMA, OK, head_step
+from vibrissa.rig.head import COMMAND_NOT_FINITE, OK, HeadModel, head_step
 from vibrissa.rig.maze import parse_maze
 from vibrissa.rig.plant import (
     ARM_PERIOD,
@@ -45,10 +45,12 @@ from vibrissa.rig.plant import (
     HeadPlant,
     HeadPlantParams,
     PlantError,
-    head_table,
+    fresh_memo,
+    head_model,
     rest_state,
 )
-from vibrissa.rig.scene import build_scene, wall_boxes
+from vibrissa.rig.rows import GAMMA
+from vibrissa.rig.scene import wall_boxes
 
 Float32s = NDArray[np.float32]
 Float64s = NDArray[np.float64]
@@ -156,9 +158,9 @@ class WhiskLoop:
         if self._law is None:
             self._plant = HeadPlant(run.boxes, run.seed, run.head)
         else:
-            self._scene = build_scene(run.boxes, float(run.head.geometry.length.max()))
-            self._head = head_table(run.head)
+            self._model = head_model(run.boxes, run.head)
             self._state = rest_state(run.head)
+            self._memo = fresh_memo()
 
     def cycles(self) -> Iterator[Cycle]:
         """Run from tick 0 to the end.
@@ -218,7 +220,7 @@ class WhiskLoop:
         return bool(self._active[0]) and tick < self.run.retract_tick
 
     def _advance(self, first: int, ticks: int, poses: Float64s) -> None:
-        run, scene = self.run, self._scene
+        run = self.run
         controller = run.controller
         assert isinstance(controller, LawController) and self._law is not None
         if first == 0:
@@ -230,11 +232,8 @@ class WhiskLoop:
             run.retract_tick,
             poses,
             self._state,
-            self._head,
-            scene.boxes,
-            scene.grid,
-            scene.starts,
-            scene.items,
+            self._memo,
+            self._model,
             run.seed,
             controller.parameters,
             controller.state,
@@ -369,11 +368,8 @@ def _whisk(
     retract_tick: int,
     poses: Float64s,
     state: Float64s,
-    head: Float64s,
-    boxes: Float64s,
-    grid: Float64s,
-    starts: NDArray[np.int32],
-    items: NDArray[np.int32],
+    memo: Float64s,
+    model: HeadModel,
     seed: int,
     parameters: Float64s,
     law_state: Float64s,
@@ -405,10 +401,7 @@ def _whisk(
         for i in range(whiskers):
             held[i] = state[GAMMA, i]
         theta, x, y = signals[SAMPLED_THETA, j], signals[SAMPLED_X, j], signals[SAMPLED_Y, j]
-        status = head_step(
-            state, head, boxes, grid, starts, items, True, seed, tick, pose, last, tick == 0,
-            theta, x, y,
-        )  # fmt: skip
+        status = head_step(state, memo, model, True, seed, tick, pose, last, tick == 0, theta, x, y)
         if status != OK:
             return status
         for i in range(whiskers):

@@ -18,13 +18,14 @@ from typing import Any, Final
 import numpy as np
 import zmq
 
-from vibrissa.messages.codec import CODECS
-from vibrissa.messages.errors import MessageError
+from vibrissa.messages.codec import CODECS, header
+from vibrissa.messages.errors import DecodeError, MessageError
 from vibrissa.messages.transport import ZmqPort
 from vibrissa.messages.types import TICK_NS, Event, Order, Telemetry
 from vibrissa.processes import realtime
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.control import ControlLine
+from vibrissa.processes.gate import Gate
 from vibrissa.processes.group import Group, Steps
 from vibrissa.processes.layout import Layout
 from vibrissa.processes.node import Step, Stepper, counters, timer_frame
@@ -102,6 +103,7 @@ class Host:
         }
         self.seats = {row.name: Seat(row) for row in rows}
         self.group = Group([(self.steppers[r.name], r.hears) for r in rows], self._stepped)
+        self.gate = Gate()
         self.sent: collections.Counter[str] = collections.Counter()
         self.t0 = 0
         self.t = 0
@@ -167,11 +169,11 @@ class Host:
                 self._done = True
                 frame = self.port.receive(0.02)
                 if frame is not None:
-                    self._feed(frame)
+                    self._hear(frame)
             else:
                 realtime.sleep_until(self.t0 + tick * TICK_NS)
                 while (frame := self.port.receive(0)) is not None:
-                    self._feed(frame)
+                    self._hear(frame)
                 if self.stopping:
                     break
                 self._feed(timer_frame(self.nodes[0], tick))
@@ -182,17 +184,29 @@ class Host:
         while not self.stopping:
             frame = self.port.receive(0.05)
             if frame is not None:
-                self._feed(frame)
+                self._hear(frame)
             self._housekeep()
 
     def _drain_loop(self) -> None:
         while not self.stopping:
-            frame = self.port.receive(0)
+            try:
+                frame = self.port.receive(0)
+            except DecodeError as error:  # a bundle that is none
+                self.gate.refuse("?", str(error))
+                continue
             if frame is None:
                 time.sleep(DRAIN_S)
             else:
-                self._feed(frame)
+                self._hear(frame)
             self._housekeep()
+
+    def _hear(self, frame: bytes) -> None:
+        """Take a frame from the bus, unless it is none that this process may hear."""
+        if self.gate.admits(frame):
+            try:
+                self._feed(frame)
+            except DecodeError as error:
+                self.gate.refuse(header(frame)[1], str(error))
 
     def _feed(self, frame: bytes) -> None:
         self._mark = time.monotonic_ns()
@@ -258,6 +272,8 @@ class Host:
         self._flush(final=False)
         steps = sum(s.steps for s in self.steppers.values())
         self.control.say("beat", t=self.t, steps=steps, done=self._done)
+        for source, (count, cause) in self.gate.take_refused().items():
+            self.control.say("refused", source=source, count=count, cause=cause)
         if self._leave_at:
             self.stopping |= now >= self._leave_at
         elif os.getppid() != self._parent:

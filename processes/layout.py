@@ -18,6 +18,7 @@ SUPERVISOR_HEARS = (
     "node.answer",
     "node.event",
     "whisk.calibration",
+    "whisk.failure",
 )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import traceback
 from pathlib import Path
 
 import zmq
@@ -31,6 +32,10 @@ def main() -> None:
     except (MessageError, LogError, RunError) as error:
         report_failure(layout.endpoints["control"], name, str(error))
         sys.exit(2)
+    except Exception as error:
+        traceback.print_exc()
+        report_failure(layout.endpoints["control"], name, f"{type(error).__name__}: {error}")
+        sys.exit(1)
 
 
 def report_failure(endpoint: str, name: str, cause: str) -> None:

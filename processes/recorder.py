@@ -15,12 +15,13 @@ from typing import Final
 
 import zmq
 
-from vibrissa.messages.errors import MessageError
+from vibrissa.messages.errors import DecodeError, MessageError
 from vibrissa.messages.log_format import LogError
 from vibrissa.messages.transport import ZmqPort
 from vibrissa.processes import realtime
 from vibrissa.processes.control import ControlLine
 from vibrissa.processes.framelog import FrameLog
+from vibrissa.processes.gate import Gate
 from vibrissa.processes.layout import Layout
 
 SYNC_S: Final = 0.03
@@ -44,6 +45,7 @@ class Recorder:
         )
         meta = dict(layout.metadata)
         self.log = FrameLog(Path(layout.log), meta.pop("run_id"), meta)
+        self.gate = Gate(limited=False)
         self.t = 0
         self._parent = os.getppid()
 
@@ -79,6 +81,8 @@ class Recorder:
                 beat = now
                 steps = sum(self.log.received.values())
                 self.control.say("beat", t=self.t, steps=steps, done=False)
+                for source, (count, cause) in self.gate.take_refused().items():
+                    self.control.say("refused", source=source, count=count, cause=cause)
             order = self.control.hear(0)
             if order and order["kind"] == "finish":
                 cause, expected, deadline = order["cause"], order["sent"], now + FINISH_S
@@ -98,10 +102,19 @@ class Recorder:
 
     def _drain(self) -> int:
         took = 0
-        while took < 5000 and (frame := self.port.receive(0)) is not None:
-            self.t = max(self.t, self.log.write(frame))
+        while took < 5000 and (frame := self._receive()) is not None:
+            if self.gate.admits(frame):
+                self.t = max(self.t, self.log.write(frame))
             took += 1
         return took
+
+    def _receive(self) -> bytes | None:
+        """The next frame; b"" for a bundle that is none."""
+        try:
+            return self.port.receive(0)
+        except DecodeError as error:
+            self.gate.refuse("?", str(error))
+            return b""
 
     def _keep_draining(self) -> None:
         """After a failed write: take messages off the publishers' hands until the run is over."""

@@ -24,6 +24,8 @@ FRESH_PATIENCE_TICKS: Final = 2000
 """How long a newcomer may take to answer 40 ticks in a row on time before a swap is refused."""
 RETRY_TICKS: Final = 200
 ANSWER_PATIENCE_TICKS: Final = 20_000
+LONG: Final = ("parameters", "value")
+"""Arguments that may have 2000 characters; others have at most 200."""
 NO_PARAMETERS: Final = {"rig", "sampler", "arm", "slam"}
 
 Program = Generator[None, None, str]
@@ -71,8 +73,10 @@ class Requests:
         self.slots: dict[str, str] = {"whisk": run.experiment.whisk.controller}
         """slot -> controller, of everything that has the drives or is in shadow"""
         self._used: list[str] = []
+        self._loading: list[str] = []
         self.owner = "whisk"
         self.shadows: dict[str, dict[str, Any]] = {}
+        self._installed = available(run.experiment)
 
     def ask(self, verb: str, arguments: dict[str, Any], reply: Reply) -> None:
         """Begin a request; `reply` is called once, at its end."""
@@ -86,6 +90,12 @@ class Requests:
         if verb not in programs:
             reply(False, f"{verb[:40]!r}: expected one of {', '.join(programs)}", {})
             return
+        for key, value in arguments.items():
+            most = 2000 if key in LONG else 200
+            if not _sound(value, most):
+                expected = f"a number, or at most {most} ASCII characters"
+                reply(False, f"{verb}: {str(key)[:40]}: expected {expected}", {})
+                return
         try:
             program = programs[verb](**arguments)
         except TypeError as error:
@@ -110,6 +120,13 @@ class Requests:
                 self._programs.remove(entry)
                 reply(False, str(error), self.report())
 
+    def end(self, cause: str) -> None:
+        """Refuse everything that is still going on."""
+        for program, reply in self._programs:
+            program.close()
+            reply(False, cause, {})
+        self._programs.clear()
+
     def heard(self, message: Message) -> None:
         """Take an answer, a change of ownership or a status from the bus."""
         body = message.body
@@ -131,6 +148,12 @@ class Requests:
         self.slots.pop(slot, None)
         self.shadows.pop(slot, None)
 
+    def failed(self, slot: str) -> None:
+        """The controller in a slot failed; it is not asked again, and its slot ends."""
+        if slot in SLOTS:
+            self._order("close", slot, "")
+        self.lost(slot)
+
     def report(self) -> dict[str, Any]:
         """Installed controllers, and the loaded ones with how they do."""
         loaded = [
@@ -142,10 +165,11 @@ class Requests:
             }
             for slot, controller in self.slots.items()
         ]
-        return {"installed": available(self._run.experiment), "loaded": loaded}
+        return {"installed": self._installed, "loaded": loaded}
 
     def _list(self) -> Program:
         yield
+        self._installed = available(self._run.experiment)
         return f"{len(self.slots)} loaded, {self.owner} has the drives"
 
     def _swap(
@@ -153,7 +177,7 @@ class Requests:
     ) -> Program:
         if when not in ("now", NEXT_CYCLE):
             raise RunError(f"swap: when is {when!r}, expected now or {NEXT_CYCLE}")
-        if not 0 <= blend <= 1:
+        if isinstance(blend, str) or not 0 <= blend <= 1:
             raise RunError(f"swap: blend is {blend} s, expected 0 to 1")
         slot = yield from self._loaded(name, parameters)
         return (yield from self._switch(slot, -1, when == NEXT_CYCLE, blend))
@@ -227,14 +251,21 @@ class Requests:
 
     def _loaded(self, name: str, parameters: str) -> Generator[None, None, str]:
         """The slot in which a controller answers in shadow, loaded if it was not."""
-        if name not in available(self._run.experiment):
-            known = ", ".join(available(self._run.experiment))
-            raise RunError(f"unknown controller {name!r}, expected one of {known}")
-        for slot, controller in self.slots.items():
-            if controller == name and not parameters:
+        for slot, controller in list(self.slots.items()):
+            if name in (slot, controller) and not parameters:
+                while slot in self._loading:
+                    yield
+                if slot not in self.slots:
+                    raise RunError(f"{name} could not be loaded")
                 return slot
+        if name not in self._installed:
+            self._installed = available(self._run.experiment)
+        if name not in self._installed:
+            known = ", ".join(self._installed)
+            raise RunError(f"unknown controller {name!r}, expected one of {known}")
         slot = self._free_slot()
         self.slots[slot] = name
+        self._loading.append(slot)
         try:
             self._order("open", slot, name)
             self._run.start_slot(slot, name)
@@ -242,14 +273,18 @@ class Requests:
                 yield
             while not self._run.hand_over_calibration():
                 yield
-            assigned = self._order("assign", slot, name, value=parameters)
-            for number in (assigned, self._order("register", "sampler", slot)):
-                accepted, text = yield from self._answer(number)
+            for kind, node, value in (("assign", slot, parameters), ("register", "sampler", "")):
+                other = name if kind == "assign" else slot
+                accepted, text = yield from self._answer(
+                    self._order(kind, node, other, value=value)
+                )
                 if not accepted:
                     raise RunError(text)
         except RunError as error:
-            self.lost(slot)
+            self.failed(slot)
             raise RunError(f"{name} could not be loaded: {error}") from None
+        finally:
+            self._loading.remove(slot)
         return slot
 
     def _free_slot(self) -> str:
@@ -279,3 +314,10 @@ class Requests:
                 raise RunError("no answer: the node that was asked does not obey")
             yield
         return self._answers[number].pop(0)
+
+
+def _sound(value: Any, most: int) -> bool:
+    """Whether an argument of a client can be worked with."""
+    if isinstance(value, str):
+        return value.isascii() and len(value) <= most
+    return isinstance(value, (int, float))

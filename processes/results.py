@@ -63,6 +63,11 @@ class Verdict:
         return dataclasses.asdict(self)
 
 
+def one_line(text: str) -> str:
+    """A cause as it travels: one line of printable ASCII, at most 400 characters."""
+    return " ".join(text.encode("ascii", "replace").decode().split())[:400]
+
+
 class RunError(Exception):
     """A run or re-run that can't be done: one line that says what, where and why."""
 

@@ -60,9 +60,13 @@ class SamplerNode:
                 return self._reading(body)
             case "whisk.command":
                 return self._command(message.source, message.epoch, body)
+            case "whisk.failure":
+                return self._failed(ControllerId(message.source, message.epoch), body.cause)
+            case "run.event" if body.kind == "lost":
+                return self._failed(ControllerId(body.node), body.cause)
             case "run.order" if body.node == "sampler":
                 return self._obey(body)
-            case "run.event" if body.kind == "start":
+            case "run.event" if body.kind == "start" and not self._retracting:
                 return self._route(CONTROLLER)
             case "run.event" | "host.event" if body.kind in ("retract", "stop"):
                 return self._start_retracting()
@@ -107,6 +111,10 @@ class SamplerNode:
             return outputs  # counted; one event per late command would flood the log
         return outputs + self._routed(command.tick, routing)
 
+    def _failed(self, controller: ControllerId, cause: str) -> list[Output]:
+        """A controller is known to be gone: its rule, or the switch to it, ends in this tick."""
+        return self._routed(self._arbiter.tick, self._arbiter.on_failure(controller, cause))
+
     def _recover(self, tick: int) -> list[Output]:
         """Count a late controller's punctual answers; enough of them give it the drives again."""
         if tick != self._arbiter.tick or self._late_one is None:
@@ -149,6 +157,8 @@ class SamplerNode:
         arbiter = self._arbiter
         named = ControllerId(order.name)
         at = None if order.at < 0 else order.at
+        if self._retracting and order.kind in ("swap", "rollback"):
+            return [self._answer(order.request, False, "the run is ending, whiskers retract")]
         match order.kind:
             case "register":
                 decision = arbiter.register(named)

@@ -28,6 +28,7 @@ from vibrissa.processes.table import PROCESSES, ROWS
 
 RECEIPT_BATCH = 400
 PROGRESS_TICKS = 1000
+COMPLETED = "completed"
 
 
 class Recording:
@@ -99,17 +100,20 @@ def simulate(
             desk.tick = tick
             group.feed(timer_frame("rig", tick))
             desk.requests.poll()
+            if desk.cause != COMPLETED:
+                break
             if tick % PROGRESS_TICKS == 0:
                 on_progress(Progress("simulating", tick / TICK_HZ, experiment.run.duration))
-        desk.tick = experiment.ticks
-        desk.decide("stop", "completed")
-        recording.finish("completed")
+        else:
+            desk.tick = experiment.ticks
+        desk.decide("stop", desk.cause)
+        recording.finish(desk.cause)
         counted = {n: counters(m) for n, m in members.items() if isinstance(m, Stepper)}
     elapsed = time.monotonic() - began
     sampler = counted.get("sampler", {})
     summary = {
-        "ok": True,
-        "cause": "completed",
+        "ok": desk.cause == COMPLETED,
+        "cause": desk.cause,
         "mode": "simulate",
         "executor": executor,
         "ticks": sampler.get("ticks", experiment.ticks),
@@ -139,6 +143,7 @@ class _Desk:
         self.tick = 0
         self.group: Group
         self.events: list[dict[str, Any]] = []
+        self.cause = COMPLETED
         self.requests = Requests(self)
         self._log = log
         self._seq: collections.Counter[str] = collections.Counter()
@@ -158,9 +163,13 @@ class _Desk:
         self.requests.heard(message)
         if topic == "whisk.calibration":
             self._calibration = message.body
-        elif topic == "node.event":
+        elif topic in ("node.event", "whisk.failure"):
             event: Event = message.body
             self.events.append(dataclasses.asdict(event))
+        if topic == "whisk.failure":
+            self.requests.lost(message.source)
+            if not self.requests.slots:
+                self.cause = f"no controller left: {message.body.cause}"
 
     def order(self, order: Order) -> None:
         """Put an order on the bus."""

@@ -34,21 +34,28 @@ from vibrissa.messages.types import TICK_HZ, TICK_NS, Event, Order, WhiskCalibra
 from vibrissa.processes import provenance
 from vibrissa.processes.config import RETRACT_S, Experiment
 from vibrissa.processes.control import ControlDesk
+from vibrissa.processes.gate import Gate
 from vibrissa.processes.layout import Layout
 from vibrissa.processes.registry import listed
 from vibrissa.processes.requests import Requests, scheduled_slots
-from vibrissa.processes.results import OnProgress, Progress, RunError, silent
+from vibrissa.processes.results import OnProgress, Progress, RunError, one_line, silent
 from vibrissa.processes.table import PROCESSES, RECORDER_SILENCE, ROWS, SLOTS
 
 LEAD_S: Final = 0.25
 """From the go to tick 0."""
 WARM_S: Final = 300.0
+LOAD_S = 120.0
+"""How long a newcomer may take to get ready while a run goes on."""
 BYE_S: Final = 5.0
 CLOSE_S: Final = 12.0
 CATCH_UP_S: Final = 60.0
 """How long a node may take to finish what it heard before the run is stopped."""
 CAUGHT_UP_TICKS: Final = 16
 """One arm cycle: the arm, at 125 Hz, is never nearer to the end than this."""
+MOST_FRAMES: Final = 1000
+"""Heard from the bus at a time."""
+FLOOD: Final = 10_000
+"""Refused frames after which a slot is ended."""
 POLL_S: Final = 0.02
 FATAL: Final = ("fault",)
 """Kinds of node.event that end a run."""
@@ -71,14 +78,19 @@ class Child:
         self.bye: dict[str, Any] | None = None
         self.closed: dict[str, Any] | None = None
 
-    def trouble(self, now: float) -> str | None:
-        """Why the run can't go on with this process, if so."""
+    def trouble(self, now: float, t: int) -> str | None:
+        """Why the run can't go on with this process, if so; t is the present time in ns."""
         code = self.popen.poll()
+        if self.last_words and (self.bye or code is not None):
+            return self.last_words
         if code is not None and self.bye is None and self.closed is None:
             how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
             return f"{self.name} ended unexpectedly ({how})"
         if now - self.heard > self.silence:
-            return f"{self.name} has been silent for {self.silence:g} s"
+            what = "has been silent for" if self.ready else "was not ready after"
+            return f"{self.name} {what} {self.silence:g} s"
+        if self.name in SLOTS and 0 < self.t < t - self.silence * 1e9:
+            return f"{self.name} is more than {self.silence:g} s behind"
         return None
 
 
@@ -91,6 +103,7 @@ class Supervisor:
         self.on_progress = on_progress
         self.children: dict[str, Child] = {}
         self.lost: dict[str, Child] = {}
+        self.left: list[Child] = []
         self.events: list[dict[str, Any]] = []
         self.sent: collections.Counter[str] = collections.Counter()
         self.cause: str | None = None
@@ -98,6 +111,8 @@ class Supervisor:
         self._calibration: WhiskCalibration | None = None
         self._seq: collections.Counter[str] = collections.Counter()
         self._interrupted = 0
+        self.gate = Gate(limited=False)
+        self._refused: collections.Counter[str] = collections.Counter()
         self.t0 = 0
         self._cpu0 = 0.0
         self._wall = 0.0
@@ -153,7 +168,9 @@ class Supervisor:
             yield folder
         except RunError:
             with contextlib.suppress(OSError):
-                self.out.rmdir()  # nothing was recorded
+                if not self.t0:  # nothing was recorded
+                    (self.out / "run.mcap").unlink(missing_ok=True)
+                self.out.rmdir()
             raise
         finally:
             shutil.rmtree(folder, ignore_errors=True)
@@ -218,7 +235,12 @@ class Supervisor:
             for child in self.children.values():
                 if child.popen.poll() is not None:
                     self._listen()  # its last words
-                    raise RunError(self.cause or f"{child.name} could not start (see above)")
+                    why = (
+                        self.cause
+                        or child.last_words
+                        or f"{child.name} could not start (see above)"
+                    )
+                    raise RunError(why)
             if self._interrupted:
                 raise RunError("interrupted before the run started")
             if time.monotonic() > deadline:
@@ -247,14 +269,19 @@ class Supervisor:
         while self.cause is None:
             self._listen()
             self._report("running", self.tick / TICK_HZ)
+            for source, (count, cause) in self.gate.take_refused().items():
+                self._count_refused("supervisor", source, count, cause)
             now = time.monotonic()
             self.requests.poll()
             for child in list(self.children.values()):
-                trouble = child.trouble(now)
-                if trouble and child.name in SLOTS:
-                    self._lose(child, trouble)
-                else:
-                    self.cause = self.cause or trouble
+                if child.name in SLOTS and child.bye and not child.last_words:
+                    self._part(child)
+                elif trouble := child.trouble(now, self.tick * TICK_NS):
+                    self._listen()  # its last words
+                    if self._expendable(child.name):
+                        self._lose(child, child.last_words or trouble)
+                    else:
+                        self.cause = self.cause or trouble
             if self._interrupted:
                 self.cause = "interrupted by the operator"
             drivers = [c for c in self.children.values() if c.done]
@@ -271,7 +298,9 @@ class Supervisor:
             )
         else:
             self._decide("retract", str(self.cause))
+            self.requests.end("the run is ending")
             self._until(RETRACT_S, "retracting", lambda: False)
+        self.requests.end("the run has ended")
         self._decide("stop", str(self.cause))
         self._until(BYE_S, "stopping", lambda: all(c.bye or _dead(c) for c in hosts))
         recorder = self.children["recorder"]
@@ -309,17 +338,18 @@ class Supervisor:
         )
         layout.write(self.folder / f"layout-{slot}.json")
         self._start(slot)
-        self.children[slot].silence = WARM_S
+        self.children[slot].silence = LOAD_S
 
     def slot_ready(self, slot: str) -> bool:
         """Whether a slot's process is warm and heard; it then joins the run. Raises RunError."""
         child = self.children.get(slot)
         if child is None:
-            raise RunError("its process ended before it was ready")
+            raise RunError(self.lost[slot].last_words)
         if not child.ready:
             return False
-        if child.silence == WARM_S:
+        if child.silence != SLOTS[slot].silence:
             child.silence = SLOTS[slot].silence
+            child.heard = time.monotonic()
             self.desk.say(slot, "go", t0_ns=self.t0)
         return True
 
@@ -330,16 +360,41 @@ class Supervisor:
         self._publish("run.calibration", self._calibration)
         return True
 
-    def _lose(self, child: Child, trouble: str) -> None:
-        """A slot is lost; the arbiter falls back if it had the drives, and the run goes on."""
-        why = child.last_words or trouble
-        self._note(self.tick, "lost", child.name, why)
+    def _expendable(self, name: str) -> bool:
+        """Whether the run goes on without this process: it hosts one controller of several."""
+        others = self.requests.slots.keys() - {name}
+        return name in SLOTS or (name == "whisk" and self._calibration is not None and bool(others))
+
+    def _lose(self, child: Child, why: str) -> None:
+        """A controller is lost; the arbiter falls back if it had the drives; the run goes on."""
+        child.last_words = why
+        self._decide("lost", why, child.name)
         if child.popen.poll() is None:
             child.popen.kill()
         child.popen.wait()
         del self.children[child.name]
         self.lost[child.name] = child
         self.requests.lost(child.name)
+        self._check_controllers(why)
+
+    def _part(self, child: Child) -> None:
+        """A slot that was told to close has handed in everything."""
+        assert child.bye is not None
+        self.sent.update(child.bye["sent"])
+        self.desk.say(child.name, "leave")
+        self.left.append(self.children.pop(child.name))
+
+    def _failed(self, name: str, event: Event) -> None:
+        """A controller failed; its process goes on without it, or ends if it is a slot."""
+        self._note(event.tick, event.kind, event.node, event.cause)
+        self.requests.failed(name)
+        self._check_controllers(event.cause)
+
+    def _check_controllers(self, why: str) -> None:
+        """End a run that has no controller left, or none that could be calibrated."""
+        slots = self.requests.slots
+        if not slots or ("whisk" not in slots and self._calibration is None):
+            self.cause = self.cause or f"no controller left: {why}"
 
     def _until(self, seconds: float, phase: str, done: Any) -> None:
         deadline = time.monotonic() + seconds
@@ -360,15 +415,22 @@ class Supervisor:
                 break
             wait = 0.0
             self._take(*heard)
-        while (frame := self.port.receive(0)) is not None:
+        for _ in range(MOST_FRAMES):
+            frame = self.port.receive(0)
+            if frame is None:
+                break
+            if not self.gate.admits(frame):
+                continue
             try:
                 message = decode(frame)
             except MessageError as error:
-                self._note(self.tick, "refused", "supervisor", str(error))
+                self.gate.refuse("?", str(error))
                 continue
             self.requests.heard(message)
             if message.topic == "whisk.calibration":
                 self._calibration = message.body
+            if message.topic == "whisk.failure":
+                self._failed(message.source, message.body)
             if message.topic == "node.event":
                 event: Event = message.body
                 self._note(event.tick, event.kind, event.node, event.cause)
@@ -391,14 +453,25 @@ class Supervisor:
                 child.ready = True
             case "beat":
                 child.t, child.steps, child.done = message["t"], message["steps"], message["done"]
-            case "fault" if name in SLOTS:
-                child.last_words = message["cause"]
             case "fault":
-                self.cause = self.cause or f"{name}: {message['cause']}"
+                child.last_words = message["cause"] or "fault"
+                if not self._expendable(name):
+                    self.cause = self.cause or f"{name}: {message['cause']}"
+            case "refused":
+                count, cause = message["count"], message["cause"]
+                self._count_refused(name, message["source"], count, cause)
             case "bye":
                 child.bye = message
             case "closed":
                 child.closed = message
+
+    def _count_refused(self, name: str, source: str, count: int, cause: str) -> None:
+        """Note what a process would not listen to; a slot that floods others is ended."""
+        self._refused[source] += count
+        if self._refused[source] == count:  # the first time
+            self._note(self.tick, "refused", name, f"{count} frames of {source}: {cause}")
+        if self._refused[source] > FLOOD and source in SLOTS and source in self.children:
+            self._lose(self.children[source], f"{source} flooded {name}: {cause}")
 
     def _answer_client(self, name: str, verb: str, arguments: dict[str, Any]) -> None:
         def reply(accepted: bool, text: str, data: dict[str, Any]) -> None:
@@ -406,13 +479,16 @@ class Supervisor:
             with contextlib.suppress(zmq.ZMQError):  # a client that is gone needs no answer
                 self.desk.say(name, "answer", accepted=accepted, text=text, data=data)
 
-        self.requests.ask(verb, arguments, reply)
+        if self.cause is None:
+            self.requests.ask(verb, arguments, reply)
+        else:
+            reply(False, "the run is ending", {})
 
-    def _decide(self, kind: str, cause: str) -> None:
+    def _decide(self, kind: str, cause: str, node: str = "supervisor") -> None:
         """Put a decision on the bus, where every node takes it as an input and it is recorded."""
         tick = self.tick
-        self._publish("run.event", Event(tick, kind, "supervisor", cause[:400]))
-        self._note(tick, kind, "supervisor", cause)
+        self._publish("run.event", Event(tick, kind, node, one_line(cause)))
+        self._note(tick, kind, node, cause)
 
     def _publish(self, topic: str, body: Any) -> None:
         seq = self._seq[topic]
@@ -429,7 +505,7 @@ class Supervisor:
         self.on_progress(Progress(phase, done, self.experiment.run.duration, note))
 
     def _kill_all(self) -> None:
-        for child in self.children.values():
+        for child in [*self.children.values(), *self.left]:
             if child.popen.poll() is None:
                 child.popen.kill()
             child.popen.wait()

@@ -55,7 +55,14 @@ PROCESSES: Final[dict[str, Process]] = {
         Process(
             "sampler",
             "vibrissa.processes.sampler:SamplerNode",
-            hears=("rig.sample", "whisk.command", "run.order", "run.event", "host.event"),
+            hears=(
+                "rig.sample",
+                "whisk.command",
+                "whisk.failure",
+                "run.order",
+                "run.event",
+                "host.event",
+            ),
             says=(
                 "head.sample",
                 "head.command",
@@ -77,6 +84,7 @@ PROCESSES: Final[dict[str, Process]] = {
                 "whisk.command",
                 "whisk.cycle",
                 "whisk.calibration",
+                "whisk.failure",
                 "node.answer",
                 "node.event",
             ),

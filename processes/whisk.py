@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import PurePath
+from typing import Any, Final
 
 import numpy as np
 
 from vibrissa.control.calibration import Calibration, CalibrationError, Calibrator
 from vibrissa.control.controller import Controller
+from vibrissa.control.drives import Violation, check_command
+from vibrissa.control.kinematics import Float32s
 from vibrissa.messages.codec import Message
 from vibrissa.messages.types import (
     TICK_NS,
@@ -25,11 +29,17 @@ from vibrissa.messages.types import (
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.controllers import make_controller
 from vibrissa.processes.node import Output
-from vibrissa.processes.results import RunError
+from vibrissa.processes.results import RunError, one_line
 
 DISTURBANCE = 0.02
 """Largest distance of the drives' command from the controller's in free whisking, rad."""
 MOST_ATTEMPTS = 20
+TELLABLE: Final = np.full(WHISKERS, 6.3, np.float32)
+"""The widest command that travels, rad; the arbiter judges it by the travel of the drives."""
+
+
+class ControllerFailure(Exception):
+    """A controller raised an error, or answered with what is no command."""
 
 
 class WhiskNode:
@@ -42,6 +52,9 @@ class WhiskNode:
     touch during calibration is a fault that ends the run, because the thresholds would be blind.
     Cycles in which the drives did not get what was commanded are no free whisking; calibration
     starts over after them. A controller that comes later is handed the calibration.
+
+    A controller that raises an error, or answers with anything but 18 finite angles, has failed: it
+    is never asked again, and the sampler hears of it in the same tick.
     """
 
     def __init__(self, experiment: Experiment, name: str = "whisk") -> None:
@@ -68,7 +81,7 @@ class WhiskNode:
     def step(self, message: Message) -> Iterable[Output]:
         match message.topic:
             case "head.sample":
-                return [] if self._controller is None else self._answer(message.body)
+                return [] if self._controller is None else self._watched(message.body)
             case "head.owner":
                 self._change = message.body
             case "run.calibration":
@@ -81,6 +94,13 @@ class WhiskNode:
         """Whisk cycles completed as the owner of the drives."""
         return {"cycles": self._cycles}
 
+    def _watched(self, sample: HeadSample) -> Iterator[Output]:
+        try:
+            yield from self._answer(sample)
+        except ControllerFailure as failure:
+            self._controller = self._calibrator = None
+            yield "whisk.failure", Event(sample.tick, "failed", self.name, one_line(str(failure)))
+
     def _answer(self, sample: HeadSample) -> Iterator[Output]:
         controller = self._controller
         assert controller is not None
@@ -90,10 +110,11 @@ class WhiskNode:
         if not self._awake:
             self._awake = True
             self._cycle_start = tick
-            controller.activate(tick, sample.command, sample.theta)
+            _call(controller.activate, tick, sample.command, sample.theta)
             self._command = sample.command
         before = self._command
-        command = self._command = controller.step(tick, sample.theta, sample.x, sample.y)
+        answer = _call(controller.step, tick, sample.theta, sample.x, sample.y)
+        command = self._command = _checked(answer)
         yield "whisk.command", WhiskCommand(tick, command)
         np.maximum(self._protraction, command, out=self._protraction)
         calibrating = self._calibrator is not None
@@ -120,9 +141,9 @@ class WhiskNode:
         try:
             text = self._assign(order) if order.kind == "assign" else self._set(order)
             accepted = 1
-        except (RunError, ValueError) as error:
-            text, accepted = str(error), 0
-        return [("node.answer", Answer(order.request, tick, accepted, self.name, text[:400]))]
+        except Exception as error:  # whatever a stranger's controller raises
+            text, accepted = f"{error}" or type(error).__name__, 0
+        return [("node.answer", Answer(order.request, tick, accepted, self.name, one_line(text)))]
 
     def _assign(self, order: Order) -> str:
         controller = make_controller(order.name, self._experiment, order.value)
@@ -158,7 +179,7 @@ class WhiskNode:
         self._calibrator = None
         self._calibration = calibration
         if self._controller is not None:
-            self._controller.calibrate(calibration)
+            _call(self._controller.calibrate, calibration)
         return [("whisk.calibration", as_message(calibration))]
 
     def _start_over(self, tick: int) -> list[Output]:
@@ -187,6 +208,37 @@ class WhiskNode:
         self._cycle_start = tick + 1
         self._protraction[:] = 0
         return cycle
+
+
+def _call(method: Callable[..., Any], *arguments: object) -> Any:
+    """Ask a controller, whose errors are its own and not ours."""
+    try:
+        return method(*arguments)
+    except Exception as error:
+        trace = error.__traceback__
+        assert trace is not None
+        while trace.tb_next is not None:
+            trace = trace.tb_next
+        where = f"{PurePath(trace.tb_frame.f_code.co_filename).name}, line {trace.tb_lineno}"
+        raise ControllerFailure(f"{type(error).__name__}: {error} ({where})") from error
+
+
+def _checked(answer: Any) -> Float32s:
+    """The answer as a command that can travel, float32[18] rad. Raises ControllerFailure."""
+    try:
+        command = np.ascontiguousarray(answer, dtype=np.float32)
+    except (TypeError, ValueError):
+        raise ControllerFailure(
+            f"answered with {type(answer).__name__}, expected 18 angles"
+        ) from None
+    if command.shape != (WHISKERS,):
+        raise ControllerFailure(
+            f"wrong length: command of shape {np.shape(answer)}, expected ({WHISKERS},)"
+        )
+    reason, whisker = check_command(abs(command), TELLABLE)
+    if reason:
+        raise ControllerFailure(str(Violation(0, reason, whisker, float(command[whisker]), 6.3)))
+    return command
 
 
 def _fault(tick: int, cause: str) -> Output:

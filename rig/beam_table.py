@@ -5,14 +5,14 @@ interpolation. Two kinds:
 
 - peg: rows q, the diameter at the peg's distance over the base's, from LEAST_Q to 1; columns
   s = 1 - sqrt(1 - (gamma / gamma_most)^2), with gamma_most(q) the impingement beyond which no
-  equilibrium exists and the shaft slides off. There the moment falls like a square root; in s it is
-  smooth. Entries: moment over the small-angle one; (arc length - 1) / gamma^2; angle of the shaft at
-  the contact over gamma; gamma_most. Valid for every shaft, since q is all that tells them apart.
+  equilibrium exists and the shaft slides off. There the moment falls like a square root; in s it
+  is smooth. Entries: moment over the small-angle one; (arc length - 1) / gamma^2; angle of the
+  shaft at the contact over gamma; gamma_most. Valid for every shaft: only q tells them apart.
 - tip on a plane, one for each tip over base diameter: rows height, the distance of the base from
   the plane over the length, from LEAST_HEIGHT to 1; columns (first - turn) / first, with first the
   angle to the plane's normal at which the straight shaft touches. Entries: moment over the
-  small-angle one; offset of the contact along the plane, and arc length to it, over their values at
-  first touch.
+  small-angle one, times height; angle of the line from base to contact to the normal, rad; arc
+  length to the contact over the length.
 
 Built with the project's own arithmetic only, so the bits are the same on every machine.
 """
@@ -104,7 +104,7 @@ def peg_table(size: int = SIZE) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=64)
 def tip_table(r: float, size: int = SIZE) -> NDArray[np.float64]:
-    """The table of a tip on a plane, float64[size, size, 4], read-only; r: tip over base diameter."""
+    """The table of a tip on a plane, float64[size, size, 4], read-only; r: tip over base."""
     table = np.zeros((size, size, 4), dtype=np.float64)
     for n in range(size):
         height = LEAST_HEIGHT + (1.0 - LEAST_HEIGHT) * n / (size - 1)
@@ -116,26 +116,41 @@ def tip_table(r: float, size: int = SIZE) -> NDArray[np.float64]:
 @compiled
 def interpolate(
     table: NDArray[np.float64], row: float, column: float
-) -> tuple[float, float, float, float]:
-    """The four entries at (row, column), each from 0 to 1 and clipped to that."""
+) -> tuple[float, float, float]:
+    """The first three entries at (row, column), each from 0 to 1 and clipped to that."""
     size = table.shape[0]
     y = min(max(row, 0.0), 1.0) * (size - 1)
     x = min(max(column, 0.0), 1.0) * (size - 1)
     i, j = min(max(int(y) - 1, 0), size - 4), min(max(int(x) - 1, 0), size - 4)
-    y0, x0 = y - i, x - j
-    y1, y2, y3 = y0 - 1.0, y0 - 2.0, y0 - 3.0
-    x1, x2, x3 = x0 - 1.0, x0 - 2.0, x0 - 3.0
-    a = (-y1 * y2 * y3 / 6.0, 0.5 * y0 * y2 * y3, -0.5 * y0 * y1 * y3, y0 * y1 * y2 / 6.0)
-    b0, b1 = -x1 * x2 * x3 / 6.0, 0.5 * x0 * x2 * x3
-    b2, b3 = -0.5 * x0 * x1 * x3, x0 * x1 * x2 / 6.0
-    p = q = r = s = 0.0
+    a, b = _weights(y - i), _weights(x - j)
+    p = q = r = 0.0
     for k in range(4):
-        w = a[k]
-        w0, w1, w2, w3 = w * b0, w * b1, w * b2, w * b3
-        t0, t1 = table[i + k, j], table[i + k, j + 1]
-        t2, t3 = table[i + k, j + 2], table[i + k, j + 3]
-        p += (w0 * t0[0] + w1 * t1[0]) + (w2 * t2[0] + w3 * t3[0])
-        q += (w0 * t0[1] + w1 * t1[1]) + (w2 * t2[1] + w3 * t3[1])
-        r += (w0 * t0[2] + w1 * t1[2]) + (w2 * t2[2] + w3 * t3[2])
-        s += (w0 * t0[3] + w1 * t1[3]) + (w2 * t2[3] + w3 * t3[3])
-    return p, q, r, s
+        u = v = w = 0.0
+        for n in range(4):
+            u += b[n] * table[i + k, j + n, 0]
+            v += b[n] * table[i + k, j + n, 1]
+            w += b[n] * table[i + k, j + n, 2]
+        p += a[k] * u
+        q += a[k] * v
+        r += a[k] * w
+    return p, q, r
+
+
+@compiled
+def most_gamma(table: NDArray[np.float64], row: float) -> float:
+    """Entry MOST of the peg table at a row from 0 to 1, clipped to that."""
+    size = table.shape[0]
+    y = min(max(row, 0.0), 1.0) * (size - 1)
+    i = min(max(int(y) - 1, 0), size - 4)
+    a = _weights(y - i)
+    total: float = a[0] * table[i, 0, MOST] + a[1] * table[i + 1, 0, MOST]
+    total += a[2] * table[i + 2, 0, MOST] + a[3] * table[i + 3, 0, MOST]
+    return total
+
+
+@compiled
+def _weights(x: float) -> tuple[float, float, float, float]:
+    """Of the cubic through values at 0, 1, 2 and 3."""
+    x1, x2, x3 = x - 1.0, x - 2.0, x - 3.0
+    low, high = x2 * x3, x * x1
+    return x1 * low * (-1.0 / 6.0), x * low * 0.5, high * x3 * -0.5, high * x2 * (1.0 / 6.0)

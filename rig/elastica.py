@@ -5,7 +5,8 @@ friction and weight. A point force F at arc length l from the base bends it; bey
 From that point the curve is integrated to the base: with sigma the arc length from the force, x
 along the tangent there (towards the base), y across, theta the angle turned,
 
-    theta' = F (x cos tilt + y sin tilt) / v^4,  x' = cos theta,  y' = sin theta,  v = 1 - k (l - sigma)
+    theta' = F (x cos tilt + y sin tilt) / v^4,  x' = cos theta,  y' = sin theta,
+    v = 1 - k (l - sigma)
 
 `tilt` turns the force from the shaft's normal towards its free end; v is the diameter over that of
 the base. Forces are in E I0 / unit^2 and moments in E I0 / unit, where the unit of length is the
@@ -28,7 +29,7 @@ STEPS = 256  # Runge-Kutta steps from contact to base; the error is below 1e-10
 TOLERANCE = 1e-12  # of the residuals, lengths in units and angles in rad
 LEAST_DIAMETER = 0.02  # of the base's, where the force acts
 
-PEG, TIP, LYING, PINNED = range(4)
+PEG, TIP, LYING = range(3)
 
 
 @compiled
@@ -75,9 +76,9 @@ def _residual(
     kind: int, taper: float, p: float, r: float, target: float, turn: float, steps: int
 ) -> tuple[float, float]:
     """How far base and target are apart, for unknowns (force p, arc or tilt r)."""
-    arc, tilt = (r, 0.0) if kind in (PEG, LYING) else (1.0, r)
+    arc, tilt = (1.0, r) if kind == TIP else (r, 0.0)
     x, y, theta = shoot(taper, arc, p, tilt, steps)
-    if kind in (PEG, PINNED):
+    if kind == PEG:
         return math.sqrt(x * x + y * y) - target, theta - atan2(y, x) - turn
     return y * cos(tilt) - x * sin(tilt) - target, theta - tilt - 0.5 * math.pi + turn
 
@@ -88,8 +89,8 @@ def solve(
 ) -> tuple[float, float, bool]:
     """Newton's method from the guess (force p, arc or tilt r); third: whether it converged.
 
-    kind PEG and PINNED (tip): target the base's distance from the point, turn the angle gamma; TIP
-    and LYING: target its distance from the plane, turn the angle from plane normal to straight shaft.
+    kind PEG: target the base's distance from the peg, turn the angle gamma; TIP and LYING: target
+    its distance from the plane, turn the angle from the plane's normal to the straight shaft.
     """
     limit = (1.0 - LEAST_DIAMETER) / taper if taper > 0.0 else 1e3
     limit = min(limit, 4.0)
@@ -109,7 +110,7 @@ def solve(
         share = 1.0
         while True:
             new_p, new_r = p + share * step_p, r + share * step_r
-            if new_p > -1e-9 and (kind in (TIP, PINNED) or 0.0 < new_r < limit) and abs(new_r) < 4.0:
+            if new_p > -1e-9 and (kind == TIP or 0.0 < new_r < limit) and abs(new_r) < 4.0:
                 new_u, new_v = _residual(kind, taper, new_p, new_r, target, turn, steps)
                 if abs(new_u) + abs(new_v) < error * (1.0 - 0.1 * share):
                     break
@@ -251,7 +252,7 @@ def follow_tip(
     """Continue a contact of the tip with a plane from one angle past first touch to a larger one.
 
     first: angle to the plane's normal at first touch; turned, to: rad past it; kind, force and rest
-    (tilt or arc length): the solution at ``turned``. Returns (kind, force, rest, whether it exists).
+    (tilt or arc length): the solution at ``turned``. Returns (kind, force, rest, whether there is).
     """
     taper = 1.0 - r
     step = to - turned
@@ -312,26 +313,6 @@ def tip_contact(
             return 0.0, 0.0, 1.0, False
     moment, offset, arc = tip_result(r, kind, force, rest, steps)
     return moment, offset, arc, True
-
-
-@compiled
-def pinned_tip(r: float, distance: float, gamma: float, steps: int) -> tuple[float, float, bool]:
-    """The tip held at a point, free to turn: (base moment in E I0 / L, tilt of the force, exists).
-
-    r: tip over base diameter; distance: from base to point over the length, below 1; gamma: rad,
-    near that at which a peg at this distance would let the tip slip. From there it is continued.
-    """
-    q = 1.0 - (1.0 - r) * distance
-    excess = math.sqrt(1.0 / distance - 1.0)
-    force, start = peg_past(q, excess, 3.0 * q * excess * math.sqrt(10.0 * q), steps)
-    force, tilt, found = force / (distance * distance), 0.0, True
-    for n in range(1, 5):
-        to = start + (gamma - start) * n / 4.0
-        force, tilt, found = solve(PINNED, 1.0 - r, force, tilt, distance, to, steps)
-        if not found:
-            return 0.0, 0.0, False
-    x, y, _theta = shoot(1.0 - r, 1.0, force, tilt, steps)
-    return force * (x * cos(tilt) + y * sin(tilt)), tilt, found
 
 
 @compiled

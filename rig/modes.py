@@ -187,7 +187,7 @@ def natural_modes(r: float, modes: int = 2, elements: int = ELEMENTS) -> Modes:
 def second_order_step(omega: float, zeta: float, dt: float) -> tuple[float, float, float, float]:
     """exp(A dt), row by row, of q'' = -omega^2 q - 2 zeta omega q': exact over one tick.
 
-    The Taylor series with 50 decimal digits, rounded once: an undamped mode neither gains nor loses.
+    The Taylor series with 50 decimal digits, rounded once: an undamped mode keeps its energy.
     """
     with localcontext() as context:
         context.prec = 50

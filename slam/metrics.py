@@ -70,6 +70,34 @@ def experience_metric(
 
     Raises MetricError for logs of different length, an unknown variant or an impossible base.
     """
+    verdicts = relocalisations(
+        experiences, poses, base, position_threshold, angle_threshold, variant
+    )
+    steps = len(verdicts) - base
+    eta = int(np.count_nonzero(verdicts))
+    eta_c = int((verdicts > 0).sum())
+    return ExperienceMetric(
+        arr=eta / steps if steps else None,
+        arcr=eta_c / eta if eta else None,
+        relocalised=eta,
+        correct=eta_c,
+        steps=steps,
+        variant=variant,
+    )
+
+
+def relocalisations(
+    experiences: ArrayLike,
+    poses: ArrayLike,
+    base: int,
+    position_threshold: float = POSITION_THRESHOLD,
+    angle_threshold: float = ANGLE_THRESHOLD,
+    variant: Variant = "or",
+) -> NDArray[np.int8]:
+    """int8[n]: 1 where a step is a correct re-localisation, -1 an incorrect one, 0 elsewhere.
+
+    Arguments and errors as for `experience_metric`.
+    """
     ids = np.asarray(experiences, dtype=np.int64)
     truth = _poses(poses, "poses")
     if ids.ndim != 1 or len(ids) != len(truth):
@@ -90,13 +118,12 @@ def experience_metric(
     valid = set(log[:base])
     relocalised: set[int] = set()
     correctly: set[int] = set()
-    eta = eta_c = 0
+    verdicts = np.zeros(n, dtype=np.int8)
     trusted = True
     for i in range(base, n):
         previous, now = log[i - 1], log[i]
         if now in last_seen and not (now == previous and previous not in relocalised):
             relocalised.add(now)
-            eta += 1
         if now in relocalised:
             dx, dy, dth = truth[i] - truth[last_seen[now]]
             near = math.hypot(dx, dy) < position_threshold and abs(wrap_pi(dth)) < angle_threshold
@@ -109,19 +136,11 @@ def experience_metric(
             }[variant]
             if trusted:
                 correctly.add(now)
-                eta_c += 1
+            verdicts[i] = 1 if trusted else -1
         if trusted:
             valid.add(previous)
         last_seen[now] = i
-    steps = n - base
-    return ExperienceMetric(
-        arr=eta / steps if steps else None,
-        arcr=eta_c / eta if eta else None,
-        relocalised=eta,
-        correct=eta_c,
-        steps=steps,
-        variant=variant,
-    )
+    return verdicts
 
 
 def first_loop_closure(experiences: ArrayLike, absent: int = 1) -> int:
@@ -213,8 +232,7 @@ def fixed_interval(n: int, interval: int = 1) -> Pairs:
 
 def all_pairs(n: int) -> Pairs:
     """Every pair i < j of n poses, int32[n (n - 1) / 2, 2]."""
-    first, second = np.triu_indices(n, k=1)
-    return np.stack([first, second], axis=1).astype(np.int32)
+    return _all_pairs(n)
 
 
 def to_tum(times: ArrayLike, poses: ArrayLike, height: float = 0.0) -> str:
@@ -243,6 +261,18 @@ def _poses(poses: ArrayLike, name: str) -> Floats:
     if not np.isfinite(array).all():
         raise MetricError(f"{name}: expected finite numbers, found NaN or infinity")
     return array
+
+
+@compiled
+def _all_pairs(n: int) -> Pairs:
+    pairs = np.empty((n * (n - 1) // 2, 2), dtype=np.int32)
+    p = 0
+    for i in range(n):
+        for j in range(i + 1, n):
+            pairs[p, 0] = i
+            pairs[p, 1] = j
+            p += 1
+    return pairs
 
 
 @compiled

@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 
 from vibrissa.numerics import compiled, exp
 from vibrissa.slam.angles import TAU
-from vibrissa.slam.attractor import COLUMN, HEADING, ROW, half_gaussian, iterate, unit_circle
+from vibrissa.slam.attractor import iterate
+from vibrissa.slam.blur import half_gaussian
 from vibrissa.slam.config import RatSlamConfig
 from vibrissa.slam.growing import grown
 from vibrissa.slam.interface import (
@@ -35,6 +36,7 @@ from vibrissa.slam.interface import (
     ACTION_NONE,
     SlamInputError,
 )
+from vibrissa.slam.path_integration import COLUMN, HEADING, ROW, unit_circle
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

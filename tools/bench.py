@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import inspect
 import operator
 import tempfile
 from collections.abc import Callable, Sequence
@@ -21,8 +22,6 @@ from vibrissa.tools.console import Json, print_json, progress_bar, stdout, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from vibrissa.processes.results import OnProgress
 
 _COMPARE: Final[dict[str, Callable[[float, float], bool]]] = {
     "==": operator.eq,
@@ -77,13 +76,17 @@ class Bench:
         }
 
 
-Run = Callable[[Path, float, "OnProgress"], Bench]
-"""A bench: (directory for what it writes, seconds of logical time, progress) -> Bench."""
+Run = Callable[..., Bench]
+"""A bench: (directory for what it writes, seconds of logical time, progress) -> Bench; those with
+a short form take quick=True as well."""
 
 BENCHES: Final[dict[str, str]] = {
     "live": "vibrissa.tools.bench_live:bench",
     "replay": "vibrissa.tools.bench_replay:bench",
     "faults": "vibrissa.tools.bench_faults:bench",
+    "slam": "vibrissa.tools.bench_slam:bench",
+    "slam-stress": "vibrissa.tools.bench_slam_stress:bench",
+    "experiment": "vibrissa.tools.bench_experiment:bench",
 }
 """name -> where its function is, imported when it is asked for."""
 
@@ -106,6 +109,9 @@ def bench(
         Path | None,
         typer.Option(help="Directory for bench-NAME.json, its picture and its logs; kept."),
     ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Small sizes, to see that a bench works (slam only).")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Measure, and compare with what was aimed at.
@@ -114,11 +120,14 @@ def bench(
     like the others; the exit code is 0 when the measurement was made.
     """
     function = load(name)
+    if quick and "quick" not in inspect.signature(function).parameters:
+        raise typer.BadParameter(f"bench {name} has no quick form; try a short --duration")
+    options = {"quick": True} if quick else {}
     with tempfile.TemporaryDirectory(prefix="vibrissa-bench-") as scratch:
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
         with progress_bar() as on_progress:
-            result = function(out or Path(scratch), duration, on_progress)
+            result = function(out or Path(scratch), duration, on_progress, **options)
         found = result.to_json()
         if out is not None:
             write_json(out / f"bench-{name}.json", found)

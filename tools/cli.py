@@ -9,8 +9,9 @@ from typing import Annotated
 import typer
 
 from vibrissa import __version__
-from vibrissa.tools import bench, doctor, logs, rerun, run
+from vibrissa.tools import bench, doctor, export, logs, rerun, run, tune
 from vibrissa.tools.console import fail
+from vibrissa.tools.experiment import command as experiment
 
 FAILED = 1
 """Exit code of a run that ended early, a re-run that diverged, a log that lost something."""
@@ -45,7 +46,7 @@ def _root(
     pass
 
 
-for room in (run, rerun, logs, bench, doctor):
+for room in (run, rerun, logs, tune, export, experiment, bench, doctor):
     for verb, example in room.VERBS:
         app.command(epilog=f"Example: `{example}`")(verb)
 

@@ -72,23 +72,55 @@ def recover(
 def plot(
     log: Log,
     out: Annotated[
-        Path | None, typer.Option(help="Picture to write (png, pdf, svg). Default: beside the log.")
+        Path | None,
+        typer.Option(
+            help="Directory for the pictures, or a file (png, pdf, svg) for the overview alone. "
+            "Default: beside the log."
+        ),
     ] = None,
 ) -> None:
-    """Draw what happened: path and map in the maze, a whisk cycle, contacts, timing."""
+    """Draw what happened: an overview of the run, and the paper's figures of the mapping.
+
+    run.png: path and map in the maze, a whisk cycle, contacts, timing. odometry.png: the true path
+    and the odometry. experiences.png: experiences over time and their re-localisations. map.png:
+    the map, by direction of travel.
+    """
     from vibrissa.tools.picture import draw
 
     path = log_file(log)
-    out = out or path.with_suffix(".png")
+    if out is not None and out.suffix:
+        with busy("drawing"):
+            draw(path).savefig(out, dpi=130)
+        stdout().print(str(out), markup=False)
+        return
+    folder = out or path.parent
+    folder.mkdir(parents=True, exist_ok=True)
+    overview = folder / f"{path.stem}.png"
     with busy("drawing"):
-        draw(path).savefig(out, dpi=130)
-    stdout().print(str(out), markup=False)
+        draw(path).savefig(overview, dpi=130)
+        stdout().print(str(overview), markup=False)
+        draw_mapping(path, folder)
+
+
+def draw_mapping(path: Path, folder: Path) -> None:
+    """The figures of the mapping into a directory; a line when the log has none to draw."""
+    from vibrissa.tools.dataset import DatasetError, load
+    from vibrissa.tools.figures import FIGURES
+
+    try:
+        data = load(path)
+    except DatasetError as error:
+        note(f"no figures of the mapping: {error}")
+        return
+    for name, draw_figure in FIGURES.items():
+        draw_figure(data).savefig(folder / f"{name}.png", dpi=130)
+        stdout().print(str(folder / f"{name}.png"), markup=False)
 
 
 VERBS = (
     (info, "vibrissa info runs/first --json"),
     (recover, "vibrissa recover runs/crashed --out runs/crashed/usable.mcap"),
-    (plot, "vibrissa plot runs/first --out first.png"),
+    (plot, "vibrissa plot runs/first --out pictures"),
 )
 
 

@@ -31,6 +31,11 @@ from vibrissa.rig.devices.errors import (
 from vibrissa.rig.devices.limits import ARM, ArmLimits, Follower, Pose
 
 TICK_NS: Final = 500_000
+ANSWER_S: Final = 3.0
+"""How long the first state may take."""
+RETRY_NS: Final = 500_000_000
+SILENT_NS: Final = 1_000_000_000
+"""Silence after which a connection is given up and made again."""
 
 
 class Safety(enum.Enum):
@@ -135,7 +140,7 @@ class ArmDevice(ABC):
         try:
             self.info = self._connect()
             self._connected = True
-            report = self._next(1.0)
+            report = self._take(ANSWER_S)
             if report is None:
                 raise DeviceRefused(f"{self.name}: connected, but sends no state")
             self._note(report)
@@ -169,7 +174,7 @@ class ArmDevice(ABC):
         deadline = time.monotonic() + timeout
         while True:
             left = deadline - time.monotonic()
-            report = self._next(max(left, 0.0)) if self._connected else None
+            report = self._take(max(left, 0.0)) if self._connected else None
             if report is not None:
                 self._note(report)
             self._look_after(time.monotonic_ns())
@@ -233,6 +238,10 @@ class ArmDevice(ABC):
         """Ticks of host time since the last state arrived."""
         return (time.monotonic_ns() - self._heard_ns) // TICK_NS
 
+    def fileno(self) -> int:
+        """What to wait on for states beside other things; -1 where there is nothing."""
+        return -1
+
     # What a back end must do.
 
     @abstractmethod
@@ -245,7 +254,7 @@ class ArmDevice(ABC):
 
     @abstractmethod
     def _next(self, timeout: float) -> ArmReport | None:
-        """The next state within `timeout` s."""
+        """The next state within `timeout` s. Raises OSError when the connection is gone."""
 
     @abstractmethod
     def _start_motion(self) -> None:
@@ -262,6 +271,14 @@ class ArmDevice(ABC):
     def _joints(self) -> ur10.Joints | None:
         """Joint angles, rad, where there are joints."""
         return None
+
+    def _take(self, timeout: float) -> ArmReport | None:
+        try:
+            return self._next(timeout)
+        except OSError:
+            self._disconnect()
+            self._connected = False
+            return None
 
     def _make_follower(self) -> Follower:
         return Follower(
@@ -286,9 +303,9 @@ class ArmDevice(ABC):
 
     def _look_after(self, now: int) -> None:
         limits = self.limits
-        if self.state is State.MOVING:
-            if now - self._setpoint_ns > limits.stale_setpoint_ticks * TICK_NS:
-                self.stop(f"no set-point for {limits.stale_setpoint_ticks} ticks")
+        idle = now - self._setpoint_ns
+        if self.state is State.MOVING and idle > limits.stale_setpoint_ticks * TICK_NS:
+            self.stop(f"no set-point for {limits.stale_setpoint_ticks} ticks")
         silence = now - self._heard_ns
         if silence <= limits.stale_ticks * TICK_NS:
             return
@@ -299,7 +316,8 @@ class ArmDevice(ABC):
         if silence > limits.patience * 1e9:
             self.state = State.LOST
             raise DeviceLost(f"{self.name}: no state for {limits.patience:g} s")
-        if (silence > 1e9 or not self._connected) and now - self._tried_ns > 1e9:
+        since_try = now - self._tried_ns
+        if (silence > SILENT_NS or not self._connected) and since_try > RETRY_NS:
             self._reconnect()
 
     def _reconnect(self) -> None:

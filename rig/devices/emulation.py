@@ -26,7 +26,7 @@ from typing import Final, Self
 from vibrissa.rig.devices.errors import DeviceUnavailable
 
 READY_S: Final = 60.0
-ANSWER_S: Final = 10.0
+ANSWER_S: Final = 30.0
 TICK_S: Final = 0.0005
 BACKLOG: Final = 2000
 """Ticks an emulator makes up for when it was kept from running."""
@@ -123,10 +123,11 @@ class Orders:
             return False
         *lines, self._rest = (self._rest + data).split(b"\n")
         for line in lines:
-            print(self._carry_out(line.decode(errors="replace").split()), flush=True)
+            print(self.carry_out(line.decode(errors="replace").split()), flush=True)
         return True
 
-    def _carry_out(self, words: list[str]) -> str:
+    def carry_out(self, words: list[str]) -> str:
+        """One order: its name and its numbers; the answer."""
         if not words or words[0] not in self._handlers:
             return f"expected one of {', '.join(self._handlers)}"
         try:

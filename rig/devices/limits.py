@@ -85,7 +85,7 @@ class ArmLimits:
     deceleration: float = 2.0
     start_jump: float = 0.02
     stale_ticks: int = 200
-    stale_setpoint_ticks: int = 100
+    stale_setpoint_ticks: int = 160
     watchdog: float = 10.0
     patience: float = 5.0
 
@@ -158,7 +158,10 @@ class Follower:
         self._first = True
 
     def follow(self, where: str, pose: Pose) -> None:
-        """Take one set-point. Raises DeviceLimit, and then nothing has changed."""
+        """Take one set-point. Raises DeviceLimit, and then nothing has changed.
+
+        The same set-point again is always fine: it asks the servo to brake and hold.
+        """
         limits = self.limits
         limits.check_pose(where, pose)
         turned = math.remainder(pose[3] - self.pose[3], 2 * math.pi)
@@ -171,7 +174,7 @@ class Follower:
             )
         vx, vy, vz, turn = (s / self.period for s in steps)
         velocity = (vx, vy, vz, turn)
-        if not self._first:
+        if not self._first and pose != self.pose:
             limits.check_rates(where, velocity, self.velocity, self.period)
         q = self.q
         if self.mount is not None and q is not None:

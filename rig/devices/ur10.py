@@ -28,6 +28,8 @@ _ROWS: Final = (
     (0.0, D5, 0.0, -1.0),
     (0.0, D6, 1.0, 0.0),
 )
+TOLERANCE: Final = 1e-6
+"""m and rad by which a pose may be missed where the arm is stretched out or its wrist aligned."""
 IDENTITY: Final[Matrix] = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 
 
@@ -58,10 +60,11 @@ def forward(q: Joints) -> Matrix:
     return t
 
 
-def solutions(flange: Matrix) -> list[Joints]:
+def solutions(flange: Matrix, wrist_3: float = 0.0) -> list[Joints]:
     """Every joint vector (up to 8, angles in +-pi) that brings the flange there; none out of reach.
 
-    Closed form of the arm with three parallel axes (shoulder, elbow, wrist 1).
+    Closed form of the arm with three parallel axes (shoulder, elbow, wrist 1). Where wrist 3 is
+    parallel to them too it may be chosen: `wrist_3`, rad.
     """
     (nx, ox, ax, px), (ny, oy, ay, py), _ = flange
     found: list[Joints] = []
@@ -73,13 +76,13 @@ def solutions(flange: Matrix) -> list[Joints]:
     for q1 in (bearing + offset + math.pi / 2, bearing - offset + math.pi / 2):
         s1, c1 = math.sin(q1), math.cos(q1)
         cosine = (px * s1 - py * c1 - D4) / D6
-        if abs(cosine) > 1.0 + 1e-9:
+        if abs(cosine) > 1.0 + TOLERANCE:
             continue
         bend = math.acos(max(-1.0, min(1.0, cosine)))
         for q5 in (bend, -bend):
             s5 = math.sin(q5)
-            if abs(s5) < 1e-9:
-                q6 = 0.0
+            if abs(s5) < TOLERANCE:
+                q6 = wrist_3
             else:
                 q6 = math.atan2((-ox * s1 + oy * c1) / s5, (nx * s1 - ny * c1) / s5)
             found += _plane(flange, q1, q5, q6)
@@ -94,7 +97,7 @@ def _plane(flange: Matrix, q1: float, q5: float, q6: float) -> list[Joints]:
     # t is the turn by q2 + q3 + q4 about the parallel axes; d4 lies along them.
     reach = math.hypot(x, y)
     cosine = (reach * reach - A2 * A2 - A3 * A3) / (2.0 * A2 * A3)
-    if abs(cosine) > 1.0 + 1e-12:
+    if abs(cosine) > 1.0 + TOLERANCE:
         return []
     elbow = math.acos(max(-1.0, min(1.0, cosine)))
     total = math.atan2(t[1][0], t[0][0])
@@ -118,7 +121,7 @@ def nearest(flange: Matrix, q: Joints) -> Joints | None:
     """The solution nearest to q, its angles continued from q; None out of reach."""
     best: Joints | None = None
     smallest = math.inf
-    for candidate in solutions(flange):
+    for candidate in solutions(flange, q[5]):
         moved = [math.remainder(c - b, 2 * math.pi) for c, b in zip(candidate, q, strict=True)]
         largest = max(map(abs, moved))
         if largest < smallest:

@@ -92,4 +92,8 @@ def _plain_array(field: Array, index: int) -> Any:
     if field.numpy_dtype.kind != "f":
         return (np.arange(count) + 16 * index).astype(field.dtype).reshape(shape)
     steps = (np.arange(count) + 1 + 32 * index) / 1024
-    return (field.limit * steps * np.where(np.arange(count) % 2, -1, 1)).astype(field.dtype).reshape(shape)
+    return (
+        (field.limit * steps * np.where(np.arange(count) % 2, -1, 1))
+        .astype(field.dtype)
+        .reshape(shape)
+    )

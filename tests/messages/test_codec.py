@@ -14,7 +14,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.messages.strategies import bits, frame, messages, plain, same
-from vibrissa.messages.codec import CODECS, MAX_FRAME_BYTES, Message, decode, encode, header, topic_of
+from vibrissa.messages.codec import (
+    CODECS,
+    MAX_FRAME_BYTES,
+    Message,
+    decode,
+    encode,
+    header,
+    topic_of,
+)
 from vibrissa.messages.errors import DecodeError, EncodeError
 from vibrissa.messages.fields import Array, Int, Real, Text
 from vibrissa.messages.types import HeadCommand, HeadSample
@@ -140,7 +148,9 @@ def test_what_is_not_finite_goes_neither_out_nor_in(topic: str, name: str, value
 
 
 @every_field
-@pytest.mark.parametrize("value", [None, "1", b"1", 1, 1.5, True, [1.0], {}, np.float32(1), object()])
+@pytest.mark.parametrize(
+    "value", [None, "1", b"1", 1, 1.5, True, [1.0], {}, np.float32(1), object()]
+)
 def test_a_value_of_another_kind_is_refused_by_name(topic: str, name: str, value: Any) -> None:
     field = CODECS[topic].fields[name]
     right = {Int: int, Real: float, Text: str, Array: np.ndarray}[type(field)]
@@ -238,7 +248,9 @@ def test_a_missing_or_an_additional_value_is_refused(topic: str) -> None:
 
 
 @every_field
-@pytest.mark.parametrize("value", [None, True, "1", b"1", 2.5, -(2**62), [], {}, msgpack.ExtType(4, b"x")])
+@pytest.mark.parametrize(
+    "value", [None, True, "1", b"1", 2.5, -(2**62), [], {}, msgpack.ExtType(4, b"x")]
+)
 def test_a_field_of_another_kind_or_range_is_refused_when_read(
     topic: str, name: str, value: Any
 ) -> None:

@@ -30,7 +30,9 @@ def test_every_topic_has_a_codec_of_its_type() -> None:
 
 
 def test_every_message_type_travels_on_some_topic() -> None:
-    defined = {t for t in vars(types).values() if isinstance(t, type) and dataclasses.is_dataclass(t)}
+    defined = {
+        t for t in vars(types).values() if isinstance(t, type) and dataclasses.is_dataclass(t)
+    }
     assert {t for t in defined if t.__module__ == types.__name__} == TYPES
 
 

@@ -54,7 +54,9 @@ class Bus:
         bundled = self.kind == "bundled"
         return self._add(self._zmq(topics, connect=self._endpoints[:], bundled=bundled))
 
-    def _zmq(self, topics: Sequence[str] = (), connect: Sequence[str] = (), bundled: bool = False) -> Port:
+    def _zmq(
+        self, topics: Sequence[str] = (), connect: Sequence[str] = (), bundled: bool = False
+    ) -> Port:
         endpoint = self.endpoint()
         port = ZmqPort(self._context, endpoint, topics, connect, bundled=bundled)
         self._endpoints.append(endpoint)
@@ -182,7 +184,9 @@ def test_a_publisher_knows_how_many_listen_to_each_topic(bus: Bus) -> None:
     second = bus.listener("head.sample")
     third = bus.listener("head.sample")
     bus.wait(speaker, head_sample=3)
-    assert speaker.subscribers().get(bus.hears("arm.state"), 0) == (3 if bus.kind == "bundled" else 1)
+    assert speaker.subscribers().get(bus.hears("arm.state"), 0) == (
+        3 if bus.kind == "bundled" else 1
+    )
     assert speaker.subscribers().get("run.event", 0) == 0
     second.close()
     bus.wait(speaker, head_sample=2)
@@ -321,7 +325,9 @@ def test_an_endpoint_in_use_is_refused_and_its_owner_not_disturbed(zmq_bus: Bus)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     endpoint = zmq_bus.endpoint()
     owner = ZmqPort(context, endpoint)
-    listener = ZmqPort(context, zmq_bus.endpoint() + "b" * (zmq_bus.kind == "ipc"), ["run.event"], [endpoint])
+    listener = ZmqPort(
+        context, zmq_bus.endpoint() + "b" * (zmq_bus.kind == "ipc"), ["run.event"], [endpoint]
+    )
     try:
         until(lambda: owner.subscribers().get("run.event", 0) == 1)
         with pytest.raises(TransportError, match="in use") as caught:
@@ -344,7 +350,14 @@ def test_a_bundle_that_is_none_is_refused_by_name(tmp_path: Path) -> None:
     )
     try:
         assert publisher.recv() == b"\x01" + BUNDLE.encode() + b"\0"
-        for garbage in (b"", b"\xc1", b"\x01", msgpack.packb([1]), msgpack.packb({1: 2}), b"\xdd\xff"):
+        for garbage in (
+            b"",
+            b"\xc1",
+            b"\x01",
+            msgpack.packb([1]),
+            msgpack.packb({1: 2}),
+            b"\xdd\xff",
+        ):
             publisher.send(BUNDLE.encode() + b"\0" + garbage)
             with pytest.raises(DecodeError, match="bundle: expected a list of frames"):
                 take(listener, 1)
@@ -375,7 +388,9 @@ def test_strangers_do_no_harm_to_a_publisher(zmq_bus: Bus) -> None:
     try:
         with contextlib.ExitStack() as stack:
             stack.enter_context(_raw_connection(endpoint)).sendall(b"GET / HTTP/1.1\r\n\r\n" * 50)
-            stack.enter_context(_raw_connection(endpoint)).sendall(b"\xff" + bytes(8) + b"\x7f" * 5000)
+            stack.enter_context(_raw_connection(endpoint)).sendall(
+                b"\xff" + bytes(8) + b"\x7f" * 5000
+            )
             for kind in (zmq.XSUB, zmq.DEALER, zmq.PUB, zmq.REQ):
                 stranger = context.socket(kind)
                 stranger.set(zmq.LINGER, 0)

@@ -17,7 +17,7 @@ class Shifted(SlamNode):
     """Believes to be 1 m further east; otherwise as good as any."""
 
     def step(self, message: Message) -> list[Any]:
-        outputs = super().step(message)
+        outputs = list(super().step(message))
         for topic, body in outputs:
             if topic == "slam.pose":
                 body.estimate = body.estimate + np.array([1.0, 0.0, 0.0])
@@ -28,7 +28,7 @@ class _Impure(SlamNode):
     """Lets what is no input get into the error of every view."""
 
     def step(self, message: Message) -> list[Any]:
-        outputs = super().step(message)
+        outputs = list(super().step(message))
         for topic, body in outputs:
             if topic == "slam.view":
                 body.error += self.impurity()
@@ -75,7 +75,7 @@ class Fails(SlamNode):
     def step(self, message: Message) -> list[Any]:
         if message.topic == "head.sample" and message.seq == 10:
             raise ZeroDivisionError("no tenth sample, please")
-        return super().step(message)
+        return list(super().step(message))
 
 
 class NoNode:

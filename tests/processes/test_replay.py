@@ -35,8 +35,9 @@ def slam_by(node: type) -> dict[str, str]:
 
 
 def said(records: list[Record], source: str) -> list[Record]:
-    """What a source said, apart from its receipts."""
-    return [r for r in records if r.source == source and not r.topic.startswith("node.re")]
+    """What a source said, apart from what its host said about it."""
+    about = ("node.receipt", "node.telemetry")
+    return [r for r in records if r.source == source and r.topic not in about]
 
 
 @pytest.fixture(scope="session")

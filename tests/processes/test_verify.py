@@ -27,7 +27,7 @@ from vibrissa.processes.verify import verify
 
 SAID = {t: row.name for row in PROCESSES.values() for t in row.says if TOPICS[t].compared}
 """Compared topics and a node that says them."""
-COMPARED = [t for t in SAID if t not in ("node.answer", "head.shadow")]
+COMPARED = [t for t in SAID if t not in ("node.answer", "head.shadow", "whisk.failure")]
 """Those that the short experiment holds."""
 
 

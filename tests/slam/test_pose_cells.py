@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.slam import oracle
-from vibrissa.slam.attractor import integrate
 from vibrissa.slam.config import IRAT, WHISKER, faithful
 from vibrissa.slam.interface import SlamInputError
+from vibrissa.slam.path_integration import integrate
 from vibrissa.slam.pose_cells import PoseCellError, PoseCells
 
 CELL = IRAT.pc_cell_x_size
@@ -72,7 +72,6 @@ def integrated(activity, step, spin, exact):
         np.ones(layers, np.uint8),
         np.arange(n),
         np.arange(n),
-        n,
         1.0,
         step,
         spin,

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.tools.mapping import write_log
 from vibrissa.messages.codec import decode, encode
 from vibrissa.messages.log import LogWriter
 from vibrissa.messages.log_format import Record
@@ -93,4 +94,13 @@ def simulated(experiment: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     out = tmp_path_factory.mktemp("runs") / "simulated"
     outcome = vibrissa("simulate", experiment, "--out", out, "--json")
     assert outcome.code == 0, outcome.err
+    return out
+
+
+@pytest.fixture(scope="session")
+def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The directory of a log of three laps: two anticlockwise, one clockwise."""
+    out = tmp_path_factory.mktemp("runs") / "mapped"
+    out.mkdir()
+    write_log(out / "run.mcap")
     return out

@@ -91,14 +91,14 @@ class Recording:
 def plant_params(case: RigCase) -> HeadPlantParams:
     """The simulated head of a case."""
     usual = HeadPlantParams()
-    tips = [
+    front, mid, rear = (
         min(tip * case.taper, base)
         for tip, base in zip(usual.shaft_tip_diameter, usual.shaft_base_diameter, strict=True)
-    ]
+    )
     return replace(
         usual,
         servo_stiffness=case.servo,
-        shaft_tip_diameter=tuple(tips),
+        shaft_tip_diameter=(front, mid, rear),
         sensor_noise=usual.sensor_noise * case.noise,
     )
 

@@ -1,9 +1,9 @@
 """Scores of a finished SLAM run against the truth, and of images without any SLAM.
 
 Pure functions of logs with one row per whisk. Terms: a step *returns* when its experience was known
-before and is not that of the step before; it returns *to an earlier circuit* when its experience was
-made in one; it is *right* when the head is within 0.1 m and 25 degrees of where that experience was
-made.
+before and is not that of the step before; it returns *to an earlier circuit* when its experience
+was made in one; it is *right* when the head is within 0.1 m and 25 degrees of where that
+experience was made.
 """
 
 from __future__ import annotations
@@ -168,9 +168,9 @@ def dead_reckoning(motion: Floats) -> Floats:
 def recognition(images: NDArray[np.uint8], truth: Floats, circuit: Ints) -> dict[str, float | None]:
     """How well single images tell places apart, before any SLAM: circuits 1, 2 against circuit 0.
 
-    auc: probability that the same place looks more alike than another one (0.5: blind); same: median
-    mean absolute difference (0 to 1) at the same place; top1: share of whisks whose most similar
-    whisk of circuit 0 is at the same place. images uint8[n, ..]; None without any same place.
+    auc: probability that the same place looks more alike than another one (0.5: blind); same:
+    median mean absolute difference (0 to 1) at the same place; top1: share of whisks whose most
+    similar whisk of circuit 0 is at the same place. images uint8[n, ..]; None without such places.
     """
     flat = images.reshape(len(images), -1).astype(np.int64)
     first, later = np.flatnonzero(circuit == 0), np.flatnonzero((circuit == 1) | (circuit == 2))
@@ -192,7 +192,7 @@ def recognition(images: NDArray[np.uint8], truth: Floats, circuit: Ints) -> dict
 def _compare(
     first: NDArray[np.int64], first_truth: Floats, later: NDArray[np.int64], later_truth: Floats
 ) -> tuple[Ints, Ints, int, int]:
-    """Histograms of image differences at the same and at other places; best matches that are right."""
+    """Histograms of image differences at the same and at other places; right best matches."""
     pixels = first.shape[1]
     alike = np.zeros(255 * pixels + 1, dtype=np.int64)
     unlike = np.zeros(255 * pixels + 1, dtype=np.int64)

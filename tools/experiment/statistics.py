@@ -20,6 +20,8 @@ Floats = NDArray[np.float64]
 RESAMPLES: Final = 10_000
 LEVEL: Final = 0.95
 BOOTSTRAP_SEED: Final = 20170904
+FEWEST: Final = 4
+"""Pairs below which no effect counts as resolved."""
 
 Reading = Literal["as in the paper", "opposite to the paper", "not resolved", "no data"]
 
@@ -101,14 +103,15 @@ def geometric_mean(values: Sequence[float]) -> float:
 def reading(difference: Difference, expected_sign: int) -> Reading:
     """Whether an effect has the paper's sign (+1: rises, -1: falls).
 
-    Resolved only when the interval of the mean difference leaves out zero and at least four fifths
-    of the pairs agree with it.
+    Resolved only with FEWEST pairs or more, when the interval of the mean difference leaves out
+    zero and at least four fifths of the pairs agree with it.
     """
     s = difference.summary
     if s.n == 0:
         return "no data"
-    rises = s.low > 0.0 and difference.up >= 0.8 * s.n
-    falls = s.high < 0.0 and difference.down >= 0.8 * s.n
+    enough = s.n >= FEWEST
+    rises = enough and s.low > 0.0 and difference.up >= 0.8 * s.n
+    falls = enough and s.high < 0.0 and difference.down >= 0.8 * s.n
     if not (rises or falls):
         return "not resolved"
     return "as in the paper" if rises == (expected_sign > 0) else "opposite to the paper"

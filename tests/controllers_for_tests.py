@@ -1,0 +1,134 @@
+"""Controllers with faults, for tests of what a run does about them.
+
+Each whisks in open loop like `open_loop` until its moment has come. `activate` is called once when
+a controller gets into shadow and once more when it gets the drives, which is how it tells.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from typing import Any
+
+import numpy as np
+
+from vibrissa.control.kinematics import Float32s
+from vibrissa.control.open_loop import OpenLoop
+from vibrissa.control.whisk_pattern import WhiskParams
+
+SHADOW_TICKS = 1000
+ACTIVE_TICKS = 100
+
+
+class Faulty(OpenLoop):
+    """Goes wrong `after` ticks in shadow (when=1) or with the drives (when=2)."""
+
+    when, after = 2, ACTIVE_TICKS
+
+    def __init__(self, whisk: WhiskParams) -> None:
+        super().__init__(whisk)
+        self._activations = 0
+        self._since = 0
+
+    def activate(self, tick: int, last_command: Float32s, theta: Float32s) -> None:
+        super().activate(tick, last_command, theta)
+        self._activations += 1
+        self._since = tick
+
+    def step(self, tick: int, theta: Float32s, x: Float32s, y: Float32s) -> Float32s:
+        command = super().step(tick, theta, x, y)
+        if self._activations >= self.when and tick >= self._since + self.after:
+            return self.fault(command)
+        return command
+
+    def fault(self, command: Float32s) -> Any:
+        raise RuntimeError("whisker motors are on fire")
+
+
+class ThrowsWhenActive(Faulty):
+    """Raises an error while it has the drives."""
+
+
+class ThrowsInShadow(Faulty):
+    """Raises an error before it has the drives."""
+
+    when, after = 1, SHADOW_TICKS
+
+
+class ThrowsAtOnce(OpenLoop):
+    """Raises an error in its first step."""
+
+    def step(self, tick: int, theta: Float32s, x: Float32s, y: Float32s) -> Float32s:
+        raise ZeroDivisionError("no first step")
+
+
+class SaysNaN(Faulty):
+    def fault(self, command: Float32s) -> Any:
+        command[4] = np.nan
+        return command
+
+
+class SaysTooMuch(Faulty):
+    """A command that travels, but not within the travel of the drives."""
+
+    def fault(self, command: Float32s) -> Any:
+        return command + np.float32(1.5)
+
+
+class SaysFarTooMuch(Faulty):
+    """A command that is no angle."""
+
+    def fault(self, command: Float32s) -> Any:
+        return command + np.float32(1e6)
+
+
+class SaysTooLittle(Faulty):
+    """A command of the wrong length."""
+
+    def fault(self, command: Float32s) -> Any:
+        return command[:17]
+
+
+class SaysNothing(Faulty):
+    def fault(self, command: Float32s) -> Any:
+        return None
+
+
+class SaysWords(Faulty):
+    def fault(self, command: Float32s) -> Any:
+        return "fast"
+
+
+class Late(Faulty):
+    """10 ms late from some moment on."""
+
+    def fault(self, command: Float32s) -> Any:
+        time.sleep(0.01)
+        return command
+
+
+class Killed(Faulty):
+    """Its process is gone at once, without a word."""
+
+    def fault(self, command: Float32s) -> Any:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Stopped(Faulty):
+    """Its process stands still."""
+
+    def fault(self, command: Float32s) -> Any:
+        os.kill(os.getpid(), signal.SIGSTOP)
+        return command
+
+
+class KilledInShadow(Killed):
+    when, after = 1, SHADOW_TICKS
+
+
+class NeverReady(OpenLoop):
+    """Does not come back from its making."""
+
+    def __init__(self, whisk: WhiskParams) -> None:
+        time.sleep(600)
