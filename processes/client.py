@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -18,22 +19,31 @@ from typing import Any, Self
 import zmq
 
 from vibrissa.processes.control import ControlLine
-from vibrissa.processes.registry import control_endpoint
+from vibrissa.processes.registry import control_endpoint, live_endpoints
 from vibrissa.processes.results import RunError
 
+LOOK_S = 1.0
 PATIENCE_S = 180.0
 """Loading a controller may include compiling it."""
 
 
+class RefusedError(RunError):
+    """A request that the run refused, with its reason; nothing has changed."""
+
+
 class Client:
-    """Asks a live run to do something; methods raise RunError with the reason of a refusal."""
+    """Asks a live run to do something; methods raise RefusedError with the reason of a refusal.
+
+    They raise RunError when there is no such run, or none any more.
+    """
 
     def __init__(self, run: Path | None = None) -> None:
         """Connect to the run that writes to directory `run`, or to the only live one."""
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         name = f"client-{os.getpid()}-{id(self):x}"
         try:
-            self._line = ControlLine(self._context, control_endpoint(run), name)
+            self._endpoint = control_endpoint(run)
+            self._line = ControlLine(self._context, self._endpoint, name)
         except Exception:
             self._context.destroy(linger=0)
             raise
@@ -42,7 +52,17 @@ class Client:
         """What is installed and what is loaded, with the state and record of each."""
         return self._ask("controllers")[1]
 
-    def swap(self, name: str, when: str = "now", blend: float = 0.0, **parameters: float) -> str:
+    def load(self, name: str, **parameters: float | bool | str) -> str:
+        """Have a controller answer in shadow, beside the one that has the drives."""
+        return self._ask("load", name=name, parameters=_as_json(parameters))[0]
+
+    def swap(
+        self,
+        name: str,
+        when: str = "now",
+        blend: float = 0.0,
+        **parameters: float | bool | str,
+    ) -> str:
         """Give the drives to a controller, loading it first if need be.
 
         when: "now" or "cycle" (at the start of the next whisk cycle); blend: s.
@@ -52,7 +72,7 @@ class Client:
             name=name,
             when=when,
             blend=blend,
-            parameters=json.dumps(parameters) if parameters else "",
+            parameters=_as_json(parameters),
         )[0]
 
     def rollback(self) -> str:
@@ -85,9 +105,16 @@ class Client:
 
     def _ask(self, verb: str, **arguments: Any) -> tuple[str, dict[str, Any]]:
         self._line.say("ask", verb=verb, arguments=arguments)
-        answer = self._line.hear(PATIENCE_S)
-        if answer is None:
-            raise RunError(f"{verb}: the run did not answer within {PATIENCE_S:g} s")
+        deadline = time.monotonic() + PATIENCE_S
+        while (answer := self._line.hear(LOOK_S)) is None:
+            if self._endpoint not in live_endpoints():
+                raise RunError(f"{verb}: the run has ended")
+            if time.monotonic() > deadline:
+                raise RunError(f"{verb}: the run did not answer within {PATIENCE_S:g} s")
         if not answer["accepted"]:
-            raise RunError(answer["text"])
+            raise RefusedError(answer["text"])
         return answer["text"], answer["data"]
+
+
+def _as_json(parameters: dict[str, float | bool | str]) -> str:
+    return json.dumps(parameters) if parameters else ""

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,20 +28,18 @@ from vibrissa.control.open_loop import OpenLoop, open_loop_command
 from vibrissa.control.rcp import Rcp, rcp_command
 from vibrissa.control.retract import Retract, retract_command
 from vibrissa.control.social import Social, social_command
-from vibrissa.messages.types import TICK_NS
 from vibrissa.numerics import compiled
 from vibrissa.processes.arm import make_path
 from vibrissa.processes.config import Experiment, slew_limit
 from vibrissa.processes.controllers import make_controller
 from vibrissa.processes.results import RunError
 from vibrissa.processes.rig import head_params
+from vibrissa.processes.trajectory import Path, Trajectory
 from vibrissa.processes.whisk import DISTURBANCE, MOST_ATTEMPTS
 from vibrissa.rig.head import COMMAND_NOT_FINITE, OK, HeadModel, head_step
 from vibrissa.rig.maze import parse_maze
 from vibrissa.rig.plant import (
     ARM_PERIOD,
-    ARM_SECONDS,
-    ArmPlantParams,
     HeadPlant,
     HeadPlantParams,
     PlantError,
@@ -63,13 +61,6 @@ SLIP: Final = 0.0175
 """Impingement lost within one tick that only a slip-off explains, rad; a drive makes 0.002."""
 SIGNALS = range(5)
 SAMPLED_THETA, SAMPLED_X, SAMPLED_Y, APPLIED, COMMANDED = SIGNALS
-
-
-class Path(Protocol):
-    """Where the arm carries the head: an `ArmPath`, or something made of one."""
-
-    def poses(self, t_ns: Int64s) -> Float64s:
-        """Poses float64[n, 4] (x, y, z m, yaw rad) at times int64[n] since departure, ns."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +138,7 @@ class WhiskLoop:
         self.run = run
         swing = run.head.geometry.swing
         self._law = LAWS.get(type(run.controller))  # type: ignore[arg-type]
-        self._trajectory = _Trajectory(run.path)
+        self._trajectory = Trajectory(run.path)
         self._buffer = np.zeros((len(SIGNALS), run.period_ticks, WHISKERS), dtype=np.float32)
         self._deepest = np.zeros(WHISKERS, dtype=np.float64)
         self._slips = np.zeros(WHISKERS, dtype=np.int64)
@@ -284,53 +275,6 @@ def _disturbed(before: Float32s, applied: Float32s, command: Float32s) -> bool:
     """Whether the drives were ever kept from what was commanded in the tick before."""
     wanted = np.concatenate((before[None], command[:-1]))
     return bool(np.abs(applied - wanted).max() > DISTURBANCE)
-
-
-class _Trajectory:
-    """The head's pose at the ends of the arm's periods: set-points reached one period late.
-
-    The arm hears of a set-point when a period ends and reaches it at the end of the next.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._departure: int | None = None
-        self._start = path.poses(np.zeros(1, dtype=np.int64))[0]
-        self._limits = ArmPlantParams()
-
-    def depart(self, tick: int) -> None:
-        """The path's time 0 is this tick; the arm moves at the first set-point made from then."""
-        self._departure = tick
-
-    def poses(self, first: int, ticks: int) -> Float64s:
-        """Poses float64[n, 4] from the period that holds `first` to the end of the last one."""
-        low, high = first // ARM_PERIOD, (first + ticks - 1) // ARM_PERIOD + 1
-        ends = np.arange(low - 2, high + 1, dtype=np.int64)  # two more tell the velocities
-        poses = np.empty((len(ends), 4), dtype=np.float64)
-        poses[:] = self._start
-        if self._departure is not None:
-            on_the_way = (ends - 2) * ARM_PERIOD >= self._departure
-            at = ((ends[on_the_way] - 1) * ARM_PERIOD - self._departure) * TICK_NS
-            if len(at):
-                poses[on_the_way] = self._path.poses(at)
-        self._check(poses, low)
-        return poses[2:]
-
-    def _check(self, poses: Float64s, period: int) -> None:
-        velocity = np.diff(poses, axis=0) / ARM_SECONDS
-        change = np.diff(velocity, axis=0)
-        for axes, speed, acceleration in (
-            (slice(0, 3), self._limits.speed, self._limits.acceleration),
-            (slice(3, 4), self._limits.turn_speed, self._limits.turn_acceleration),
-        ):
-            most = np.sqrt((velocity[1:, axes] ** 2).sum(axis=1)).max()
-            step = np.sqrt((change[:, axes] ** 2).sum(axis=1)).max()
-            if most > speed or step > acceleration * ARM_SECONDS:
-                raise PlantError(
-                    f"arm path near tick {period * ARM_PERIOD}: asks for speed {most:.3g} and "
-                    f"acceleration {step / ARM_SECONDS:.3g}, the arm can do {speed} and "
-                    f"{acceleration} (SI)"
-                )
 
 
 @compiled

@@ -17,6 +17,7 @@ SUPERVISOR_HEARS = (
     "head.shadow",
     "node.answer",
     "node.event",
+    "node.telemetry",
     "whisk.calibration",
     "whisk.failure",
 )

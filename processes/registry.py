@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import tempfile
@@ -25,7 +26,8 @@ def folder() -> Path:
 @contextlib.contextmanager
 def listed(out: Path, control: str) -> Iterator[None]:
     """List a run while it goes on."""
-    entry = folder() / f"{os.getpid()}.json"
+    name = hashlib.sha256(control.encode()).hexdigest()[:8]
+    entry = folder() / f"{os.getpid()}-{name}.json"
     entry.write_text(json.dumps({"out": str(out.absolute()), "control": control}))
     try:
         yield
@@ -33,15 +35,26 @@ def listed(out: Path, control: str) -> Iterator[None]:
         entry.unlink(missing_ok=True)
 
 
+def _entries() -> list[dict[str, str]]:
+    found = []
+    for path in sorted(folder().glob("*.json")):
+        with contextlib.suppress(OSError, ValueError):  # just ended
+            if Path(f"/proc/{path.stem.partition('-')[0]}").exists():
+                found.append(json.loads(path.read_text()))
+    return found
+
+
+def live_endpoints() -> list[str]:
+    """The control endpoints of all live runs."""
+    return [entry["control"] for entry in _entries()]
+
+
 def control_endpoint(run: Path | None = None) -> str:
     """The control endpoint of a live run: of the one in directory `run`, or of the only one.
 
     Raises RunError when there is none, or several and none was named.
     """
-    entries = []
-    for path in sorted(folder().glob("*.json")):
-        if Path(f"/proc/{path.stem}").exists():
-            entries.append(json.loads(path.read_text()))
+    entries = _entries()
     if run is not None:
         entries = [e for e in entries if Path(e["out"]) == run.absolute()]
     if not entries:
@@ -50,5 +63,4 @@ def control_endpoint(run: Path | None = None) -> str:
     if len(entries) > 1:
         names = ", ".join(e["out"] for e in entries)
         raise RunError(f"several live runs ({names}); name one with --run")
-    endpoint: str = entries[0]["control"]
-    return endpoint
+    return entries[0]["control"]

@@ -13,7 +13,7 @@ from collections.abc import Callable, Generator
 from typing import Any, Final, Protocol
 
 from vibrissa.messages.codec import Message
-from vibrissa.messages.types import TICK_HZ, Order
+from vibrissa.messages.types import TICK_HZ, Order, Telemetry
 from vibrissa.processes.config import Experiment, Swap
 from vibrissa.processes.controllers import available
 from vibrissa.processes.results import RunError
@@ -74,6 +74,7 @@ class Requests:
         """slot -> controller, of everything that has the drives or is in shadow"""
         self._used: list[str] = []
         self._loading: list[str] = []
+        self._ready: dict[str, float] = {}
         self.owner = "whisk"
         self.shadows: dict[str, dict[str, Any]] = {}
         self._installed = available(run.experiment)
@@ -82,6 +83,7 @@ class Requests:
         """Begin a request; `reply` is called once, at its end."""
         programs: dict[str, Callable[..., Program]] = {
             "controllers": self._list,
+            "load": self._load,
             "swap": self._swap,
             "rollback": self._rollback,
             "unload": self._unload,
@@ -135,6 +137,8 @@ class Requests:
                 self._answers.setdefault(body.request, []).append((bool(body.accepted), body.text))
             case "head.owner":
                 self.owner = body.controller
+            case "node.telemetry" if message.source in self.slots:
+                self._measured(message.source, body)
             case "head.shadow":
                 self.shadows[body.controller] = {
                     "fresh_ticks": body.fresh,
@@ -142,6 +146,11 @@ class Requests:
                     "mean_divergence": round(body.mean_divergence, 5),
                     "max_divergence": round(body.max_divergence, 5),
                 }
+
+    def _measured(self, node: str, telemetry: Telemetry) -> None:
+        """When a controller's answers were ready after their ticks were due, us, mean of 1 s."""
+        ready = float(telemetry.lateness_us[0] + telemetry.work_us[0])
+        self._ready[node] = round(ready, 1)
 
     def lost(self, slot: str) -> None:
         """The process of a slot is gone."""
@@ -162,6 +171,7 @@ class Requests:
                 "controller": controller,
                 "state": "active" if slot == self.owner else "shadow",
                 **self.shadows.get(slot, {}),
+                **({"ready_us": self._ready[slot]} if slot in self._ready else {}),
             }
             for slot, controller in self.slots.items()
         ]
@@ -171,6 +181,10 @@ class Requests:
         yield
         self._installed = available(self._run.experiment)
         return f"{len(self.slots)} loaded, {self.owner} has the drives"
+
+    def _load(self, name: str, parameters: str = "") -> Program:
+        slot = yield from self._loaded(name, parameters)
+        return f"{self.slots[slot]} ({slot}) answers in shadow"
 
     def _swap(
         self, name: str, when: str = "now", blend: float = 0.0, parameters: str = ""

@@ -22,10 +22,11 @@ Pacing = Literal["timer", "arrival", "drain"]
 class Process:
     """One row: a node, what it hears, what it says, and how it is hosted.
 
-    priority is SCHED_FIFO's, 0 for the ordinary scheduler; who is waited for goes first. `source` marks a stand-in for hardware:
-    what-if re-runs take its messages from the log instead of stepping it. `silence` is how many
-    seconds without a sign of life end the run. The first topic it hears drives it; from the end of
-    that step to the arrival of the topic `answer` with the same t is its reaction latency.
+    priority is SCHED_FIFO's, 0 for the ordinary scheduler; who is waited for goes first. `source`
+    marks a stand-in for hardware: what-if re-runs take its messages from the log instead of
+    stepping it. `silence` is how many seconds without a sign of life end the run. The first topic
+    it hears drives it; from that step's first output to the arrival of the topic `answer` with the
+    same t is its reaction latency.
     """
 
     name: str

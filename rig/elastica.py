@@ -25,7 +25,7 @@ import math
 
 from vibrissa.numerics import atan2, compiled, cos, sin
 
-STEPS = 256  # Runge-Kutta steps from contact to base; the error is below 1e-10
+STEPS = 400  # Runge-Kutta steps from contact to base; the error is below 1e-9
 TOLERANCE = 1e-12  # of the residuals, lengths in units and angles in rad
 LEAST_DIAMETER = 0.02  # of the base's, where the force acts
 

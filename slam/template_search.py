@@ -21,9 +21,16 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.compilation import inlined
 from vibrissa.numerics import compiled
 from vibrissa.slam.growing import grown
+from vibrissa.slam.template_bounds import (
+    EMPTY,
+    UNROLLED,
+    best_shift,
+    cell_bounds,
+    pixel_bounds,
+    quantise,
+)
 
 BUCKETS: Final = 1024
 FINE_CELLS: Final = 64
@@ -31,10 +38,7 @@ FINE_CELLS: Final = 64
 LANES_SMALL: Final = 64
 LANES_LARGE: Final = 16
 """Templates per block: many of few pixels, few of many."""
-UNROLLED: Final = 6
 BYTE: Final = 255
-EMPTY: Final = 32768
-"""Where the sums of a block's unused lanes start: above every sum of a used one."""
 FEW: Final = 4
 """Candidates of a block from which on the single-precision costs are worth computing."""
 SINGLE_EPSILON: Final = 1.2e-7
@@ -43,7 +47,6 @@ Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
-Sums = NDArray[np.uint16]
 Places = NDArray[np.uint64]
 
 
@@ -126,7 +129,7 @@ class TemplateIndex:
             block = self._new_block(bucket)
         lane = int(self._filled[block])
         self._ids[block, lane] = new
-        rounding = _quantise(template, self._rows_per_cell, self._levels, self._scratch)
+        rounding = quantise(template, self._rows_per_cell, self._levels, self._scratch)
         self._cells[block, :-1, lane] = self._scratch
         self._rounding = max(self._rounding, rounding)
         if self._pixels.size:
@@ -189,139 +192,6 @@ def _bucket(mean: float) -> int:
 
 
 @compiled
-def _quantise(template: Floats, rows_per_cell: int, levels: int, out: Bytes) -> float:
-    """The cells of a template as whole levels; the largest rounding error of one, in levels."""
-    rows, columns = template.shape
-    worst = 0.0
-    for y in range(0, rows, rows_per_cell):
-        for x in range(columns):
-            total = 0.0
-            for r in range(rows_per_cell):
-                total += template[y + r, x]
-            exact = total * levels / rows_per_cell
-            level = int(exact + 0.5)
-            out[y // rows_per_cell * columns + x] = level
-            worst = max(worst, abs(level - exact))
-    return worst
-
-
-@compiled
-def _cost(
-    view: Floats, template: Floats, margin: int, offset: int, panoramic: bool, limit: float
-) -> float:
-    """Sum of absolute differences at one shift, in row order; given up when above `limit`."""
-    rows, columns = view.shape
-    cost = 0.0
-    for y in range(rows):
-        if panoramic:
-            for x in range(columns):
-                cost += abs(view[y, x] - template[y, (x + offset) % columns])
-        else:
-            for x in range(columns - 2 * margin):
-                cost += abs(view[y, margin + x] - template[y, offset + x])
-        if cost > limit:
-            break
-    return cost
-
-
-@compiled
-def _best_shift(
-    view: Floats, template: Floats, margin: int, step: int, panoramic: bool, limit: float
-) -> tuple[float, int]:
-    """Least cost over all shifts (the first among equals), or something above `limit`."""
-    shifts = view.shape[1] if panoramic else 2 * margin + 1
-    least = np.inf
-    at = 0
-    for offset in range(0, shifts, step):
-        cost = _cost(view, template, margin, offset, panoramic, min(limit, least))
-        if cost < least:
-            least = cost
-            at = offset
-    return least, at
-
-
-@inlined
-def _apart(a: int, b: int) -> int:
-    return max(a, b) - min(a, b)
-
-
-@compiled
-def _cell_bounds(
-    mine: Bytes, under: Places, cells: Bytes, used: int, limit: int, partial: Sums, bound: Sums
-) -> int:
-    """Sum of the cells' differences at the best shift, for every lane; the least of them.
-
-    Sums above `limit` may be incomplete. Loops over all lanes have no branch, so that they become
-    vector instructions on bytes.
-    """
-    lanes = partial.shape[0]
-    for lane in range(lanes):
-        bound[lane] = 65535
-    best = np.uint16(65535)
-    for shift in range(under.shape[0]):
-        for lane in range(lanes):
-            partial[lane] = 0 if lane < used else EMPTY
-        least = np.uint16(0)
-        for p in range(0, mine.shape[0], UNROLLED):
-            m0, m1, m2 = mine[p], mine[p + 1], mine[p + 2]
-            m3, m4, m5 = mine[p + 3], mine[p + 4], mine[p + 5]
-            c0, c1, c2 = under[shift, p], under[shift, p + 1], under[shift, p + 2]
-            c3, c4, c5 = under[shift, p + 3], under[shift, p + 4], under[shift, p + 5]
-            for lane in range(lanes):
-                partial[lane] += (
-                    _apart(m0, cells[c0, lane])
-                    + _apart(m1, cells[c1, lane])
-                    + _apart(m2, cells[c2, lane])
-                    + _apart(m3, cells[c3, lane])
-                    + _apart(m4, cells[c4, lane])
-                    + _apart(m5, cells[c5, lane])
-                )
-            least = np.uint16(65535)
-            for lane in range(lanes):
-                least = min(least, partial[lane])
-            if least > limit:
-                break
-        for lane in range(lanes):
-            bound[lane] = min(bound[lane], partial[lane])
-        best = min(best, least)
-    return int(best)
-
-
-@compiled
-def _pixel_bounds(
-    view: Floats32,
-    pixels: Floats32,
-    used: int,
-    margin: int,
-    step: int,
-    panoramic: bool,
-    limit: float,
-    partial: Floats32,
-    bound: Floats32,
-) -> None:
-    """Cost in single precision at the best shift, for every lane; given up above `limit`."""
-    rows, columns = view.shape
-    compared = columns if panoramic else columns - 2 * margin
-    shifts = columns if panoramic else 2 * margin + 1
-    bound[:used] = np.float32(np.inf)
-    for offset in range(0, shifts, step):
-        partial[:used] = np.float32(0.0)
-        for y in range(rows):
-            for x in range(compared):
-                mine = view[y, margin + x]
-                theirs = pixels[y, (x + offset) % columns]
-                for lane in range(used):
-                    partial[lane] += abs(mine - theirs[lane])
-            least = np.float32(np.inf)
-            for lane in range(used):
-                least = min(least, partial[lane])
-            if least > limit:
-                break
-        for lane in range(used):
-            bound[lane] = min(bound[lane], partial[lane])
-
-
-@compiled
 def _search(
     view: Floats,
     mean: float,
@@ -351,7 +221,7 @@ def _search(
     large = pixels.size > 0
     mine = np.zeros(under.shape[1], dtype=np.uint8)
     quantised = np.empty(cells.shape[1] - 1, dtype=np.uint8)
-    rounding += _quantise(view, rows_per_cell, levels, quantised)
+    rounding += quantise(view, rows_per_cell, levels, quantised)
     for p in range(compared.shape[0]):
         mine[p] = quantised[compared[p]]
     # a template of cost c has cell sums up to c levels_per_cost + doubt
@@ -361,7 +231,7 @@ def _search(
     view32 = view.astype(np.float32) if large else np.empty((0, 0), dtype=np.float32)
     found, least, shift = -1, np.inf, 0
     if hint >= 0 and abs(mean - means[hint]) <= tolerance:
-        least, shift = _best_shift(view, templates[hint], margin, step, panoramic, np.inf)
+        least, shift = best_shift(view, templates[hint], margin, step, panoramic, np.inf)
         found = hint
     limit = _limit(least, levels_per_cost, doubt)
     partial = np.empty(lanes, dtype=np.uint16)
@@ -383,7 +253,7 @@ def _search(
         block = first[bucket]
         while block >= 0:
             used = filled[block]
-            if _cell_bounds(mine, under, cells[block], used, limit, partial, bound) <= limit:
+            if cell_bounds(mine, under, cells[block], used, limit, partial, bound) <= limit:
                 nearest = 0
                 survivors = 0
                 for lane in range(used):
@@ -393,7 +263,7 @@ def _search(
                 compared_fine = large and survivors > FEW
                 if compared_fine:
                     most = least * (1.0 + slack) + slack
-                    _pixel_bounds(
+                    pixel_bounds(
                         view32,
                         pixels[block],
                         used,
@@ -416,7 +286,7 @@ def _search(
                     candidate = ids[block, lane]
                     if candidate == hint or abs(mean - means[candidate]) > tolerance:
                         continue
-                    cost, at = _best_shift(
+                    cost, at = best_shift(
                         view, templates[candidate], margin, step, panoramic, least
                     )
                     if cost < least or (cost == least and candidate < found):

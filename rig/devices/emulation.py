@@ -53,6 +53,8 @@ class EmulatorProcess:
             self.stop()
             raise DeviceUnavailable(f"{self.name}: could not start (see above)") from None
         self.url: str = ready["url"]
+        self.hear: int = ready["hear"]
+        """Port of 127.0.0.1 at which a head that listens (`--hear`) takes its pose, else 0."""
 
     def ask(self, order: str) -> str:
         """Give an order and wait for the answer. Raises DeviceUnavailable when there is none."""
@@ -61,7 +63,7 @@ class EmulatorProcess:
         try:
             stdin.write(order.encode() + b"\n")
             stdin.flush()
-        except OSError:
+        except (OSError, ValueError):  # the latter: it was stopped
             raise DeviceUnavailable(f"{self.name}: has ended") from None
         return self._line(ANSWER_S)
 
@@ -112,9 +114,9 @@ class Orders:
         self._handlers = handlers
         self._rest = b""
 
-    def ready(self, url: str) -> None:
-        """Say that the device can be opened."""
-        print(json.dumps({"ready": True, "url": url}), flush=True)
+    def ready(self, url: str, hear: int = 0) -> None:
+        """Say that the device can be opened, and at which port it takes its pose."""
+        print(json.dumps({"ready": True, "url": url, "hear": hear}), flush=True)
 
     def take(self) -> bool:
         """Carry out what has come in; False when there will be nothing more."""
@@ -213,11 +215,13 @@ class PoseEar:
     def __init__(self, pose: Pose, port: int | None) -> None:
         """port: to listen at, None to keep the pose; 0 takes a free one."""
         self.pose = pose
+        self.port = 0
         self._socket: socket.socket | None = None
         if port is not None:
             self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             self._socket.bind(("127.0.0.1", port))
             self._socket.setblocking(False)
+            self.port = self._socket.getsockname()[1]
 
     def listen(self) -> Pose:
         """The newest pose that was told."""
@@ -252,7 +256,7 @@ def head_arguments(description: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--maze", help="maze file (default: the shipped 7 x 5 board)")
     parser.add_argument("--pose", default="0.63,0.09,0.177,0", help="head x,y,z,yaw in m, rad")
-    parser.add_argument("--hear", type=int, help="port of 127.0.0.1 at which poses are told")
+    parser.add_argument("--hear", type=int, help="port of 127.0.0.1 for poses, 0: any")
     parser.add_argument("--serial", default="VIB-EMU-1", help="which head this is")
     parser.add_argument("--seed", type=int, default=1, help="of noise, boot numbers and errors")
     parser.add_argument("--drift", type=float, default=0.0, help="of its clock, ppm")

@@ -54,7 +54,7 @@ class HeadEmulator(ABC):
 
     def run(self, url: str) -> None:
         """Until the standard input ends."""
-        self.orders.ready(url)
+        self.orders.ready(url, self.ear.port)
         stdin = sys.stdin.fileno()
         while True:
             wires = [fd for fd in (self.wire(),) if fd >= 0]

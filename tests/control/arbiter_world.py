@@ -4,6 +4,7 @@
 request is refused for, what the drives get.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -148,8 +149,8 @@ class History:
 def verdict(command: NDArray[np.float32]) -> str:
     if command.shape != (WHISKERS,):
         return "wrong length"
-    for value, limit in zip(command, TRAVEL, strict=True):
-        if not np.isfinite(value):
+    for value, limit in zip(command.tolist(), TRAVEL.tolist(), strict=True):
+        if not math.isfinite(value):
             return "not finite"
         if not 0.0 <= value <= limit:
             return "out of range"
@@ -222,7 +223,9 @@ class World:
         assert a.armed is None or a.armed.controller in self.known
         assert a.previous != RETRACT
         assert a.misses == self.misses < MISSES or a.active == RETRACT
-        owners = a.owners()
+
+    def check_snapshot(self) -> None:
+        a, owners = self.a, self.a.owners()
         assert (owners.active, owners.previous, owners.armed) == (a.active, a.previous, a.armed)
         assert list(owners.shadows) == list(self.known)
         for controller, status in owners.shadows.items():
@@ -232,6 +235,7 @@ class World:
 
     def on_sample(self, tick: int) -> Routing:
         a, before, armed = self.a, self.a.active, self.a.armed
+        self.check_snapshot()
         self.misses += self.given.get(a.tick) == []
         self.given[tick] = []
         self.sample += 1

@@ -90,7 +90,7 @@ def driven(events: list[Event]) -> World:
 
 
 @given(LISTS)
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=120, deadline=None)
 def test_the_arbiter_does_what_the_history_says_and_replays_to_the_same_bytes(
     events: list[Event],
 ) -> None:

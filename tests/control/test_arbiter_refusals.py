@@ -64,6 +64,12 @@ def armed(controller: ControllerId) -> Arbiter:
     return a
 
 
+def long_dead() -> Arbiter:
+    a = failed()
+    run(a, 2 * LAPSE, each={OLD: START})
+    return a
+
+
 def stopped() -> Arbiter:
     a = ready()
     a.route(RETRACT)
@@ -116,6 +122,7 @@ def fallen_and_stopped() -> Arbiter:
         (silent, NEW, {}, stale(9)),
         (lambda: silent(3), NEW, {}, f"not ready: {few(8)}"),
         (patchy, NEW, {}, f"not ready: {few(3)}"),
+        (long_dead, NEW, {}, f"not ready: {few(0)}"),
         (failed, NEW, {}, f"not ready: {few(0)}"),
         (lambda: ready(ticks=FRESH - 2), NEW, {}, f"not ready: {few(8)}"),
         (

@@ -217,6 +217,16 @@ def test_the_slew_limit_holds_across_a_switch_with_and_without_blend() -> None:
         assert a.last_command == pytest.approx(START + 0.9 * most * SLEW)
 
 
+def test_an_answer_that_comes_after_retracts_own_still_counts_as_fresh() -> None:
+    a = ready()
+    a.route(RETRACT)
+    a.on_sample(FRESH)
+    a.route(NEW)
+    (decision,) = a.on_command(NEW, FRESH, angles(START)).decisions
+    assert refused(decision) == f"tick {FRESH} is answered already"
+    assert a.owners().shadows[NEW].fresh_ticks == FRESH + 1
+
+
 # rollback
 
 

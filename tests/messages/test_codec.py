@@ -38,7 +38,7 @@ every_array = pytest.mark.parametrize(("topic", "name"), ARRAYS)
 
 def refusal(kind: type[Exception], call: Any, *arguments: Any) -> str:
     """The one line of the error that a call raises, which must be of exactly this kind."""
-    with pytest.raises(Exception) as caught:  # noqa: PT011 - the kind is checked below
+    with pytest.raises(Exception) as caught:
         call(*arguments)
     assert caught.type is kind, f"{caught.type.__name__}: {caught.value}"
     line = str(caught.value)
@@ -416,6 +416,6 @@ def test_the_schema_of_a_channel_is_json_that_describes_the_array_that_travels(t
         if type(value) is int and "minimum" in item:
             assert item["minimum"] <= value <= item["maximum"]
     titles = [item["title"] for item in schema["prefixItems"]]
-    told = titles + [schema["prefixItems"][-1].get("description", "")]
+    told = [*titles, schema["prefixItems"][-1].get("description", "")]
     for name in CODECS[topic].fields:
         assert any(name in text for text in told)

@@ -24,10 +24,10 @@ def children(parent: int | None = None) -> dict[str, int]:
             command = (entry / "cmdline").read_bytes().split(b"\0")
         except OSError:
             continue  # gone meanwhile
-        if int(ppid) == (parent or os.getpid()) and b"vibrissa.processes.main" in command:
-            if state != "Z":
-                name = command[command.index(b"vibrissa.processes.main") + 1].decode()
-                found[name] = int(entry.name)
+        ours = int(ppid) == (parent or os.getpid()) and b"vibrissa.processes.main" in command
+        if ours and state != "Z":
+            name = command[command.index(b"vibrissa.processes.main") + 1].decode()
+            found[name] = int(entry.name)
     return found
 
 

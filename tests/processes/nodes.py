@@ -1,4 +1,4 @@
-"""Nodes that a person might put in the place of another: a good one and some that break the rules."""
+"""Nodes a person might put in the place of another: a good one and some that break the rules."""
 
 from __future__ import annotations
 

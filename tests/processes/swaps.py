@@ -23,9 +23,9 @@ EXPERIMENT = """\
 [run]
 duration = {duration}
 [whisk]
-period = 0.2
+period = 0.4
 controller = "open_loop"
-calibration_cycles = 2
+calibration_cycles = 1
 [controllers]
 {controllers}
 {swaps}

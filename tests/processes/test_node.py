@@ -157,14 +157,9 @@ def test_what_nobody_hears_is_no_step() -> None:
     assert order == []
 
 
-STEPS = st.lists(
-    st.tuples(
-        st.sampled_from([("head.sample", "sampler", 0), ("run.event", "supervisor", 0), ("host.timer", "rig", 3)]),
-        st.integers(0, 2**32 - 1),
-        st.integers(0, 2**32 - 1),
-    ),
-    max_size=30,
-)  # fmt: skip
+STREAMS = [("head.sample", "sampler", 0), ("run.event", "supervisor", 0), ("host.timer", "rig", 3)]
+U32 = st.integers(0, 2**32 - 1)
+STEPS = st.lists(st.tuples(st.sampled_from(STREAMS), U32, U32), max_size=30)
 
 
 @given(STEPS, st.integers(1, 7))

@@ -25,18 +25,16 @@ MAY_IMPORT = {
 BELOW = {"numerics", "compilation", "elementary", "philox"}
 NODES = [f"processes/{name}.py" for name in ("rig", "sampler", "whisk", "arm", "slam")]
 
-IMPURE = set(
-    "time datetime random secrets uuid os threading _thread multiprocessing concurrent asyncio "
-    "subprocess socket select selectors signal io tempfile shutil logging locale platform getpass "
-    "urllib http sqlite3 ctypes zmq serial can".split()
-)
+IMPURE = {"time", "datetime", "random", "secrets", "uuid", "os", "io", "tempfile", "shutil"}
+IMPURE |= {"threading", "_thread", "multiprocessing", "concurrent", "asyncio", "subprocess"}
+IMPURE |= {"socket", "select", "selectors", "signal", "urllib", "http", "zmq", "serial", "can"}
+IMPURE |= {"logging", "locale", "platform", "getpass", "sqlite3", "ctypes"}
 OUTSIDE_STEPS = {"rig/maze.py", "slam/config.py"}
 OUTSIDE_STEPS |= {"processes/config.py", "processes/table.py", "processes/controllers.py"}
 """Read files or look up names when an experiment or a controller is made, never in a step."""
-ELEMENTARY = set(
-    "sin cos tan asin acos atan atan2 arcsin arccos arctan arctan2 sinh cosh tanh exp exp2 expm1 log "
-    "log2 log10 log1p pow power hypot cbrt".split()
-)
+ELEMENTARY = {"sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "exp"}
+ELEMENTARY |= {"arcsin", "arccos", "arctan", "arctan2", "exp2", "expm1", "log", "log2", "log10"}
+ELEMENTARY |= {"log1p", "pow", "power", "hypot", "cbrt"}
 ALGEBRA = {"dot", "vdot", "inner", "matmul", "einsum", "tensordot", "linalg", "fft"}
 SCORES = {"slam/metrics.py": {"hypot", "sin", "cos"}}
 """Scores, and the export of trajectories: nothing a node decides by depends on them."""

@@ -77,6 +77,13 @@ def expected_ids(config, images):
 
 CONFIGS = {
     "whisker": replace(WHISKER, vt_match_threshold=0.05),
+    "blocks": replace(WHISKER, vt_match_threshold=0.05),
+    "large": RatSlamConfig(
+        template_x_size=20, template_y_size=8, vt_shift_match=2, vt_step_match=1
+    ),
+    "large, step 3": RatSlamConfig(
+        template_x_size=20, template_y_size=7, vt_shift_match=3, vt_step_match=3
+    ),
     "single pixel": replace(WHISKER, template_x_size=1, template_y_size=1),
     "shifted": RatSlamConfig(
         template_x_size=9, template_y_size=2, vt_shift_match=3, vt_step_match=2
@@ -93,7 +100,9 @@ CONFIGS = {
 def test_search_finds_what_exhaustive_search_finds(name, seed, levels):
     config = CONFIGS[name]
     rng = np.random.default_rng(seed)
-    shape = (40, config.template_y_size, config.template_x_size)
+    # more than one pixel to a block makes means that are no whole bytes
+    block = 3 if name in ("blocks", "large") else 1
+    shape = (40, block * config.template_y_size, block * config.template_x_size)
     images = (rng.integers(0, levels, shape) * (255 // (levels - 1))).astype(np.uint8)
     images[20:] = np.clip(images[:20].astype(int) + rng.integers(-9, 10, shape)[:20], 0, 255)
     for found, number, error, _ in expected_ids(config, images):
@@ -121,6 +130,25 @@ def test_search_over_thousands_of_templates_of_equal_mean_is_exact():
         number, cost, _ = oracle.match(mine.templates[0], templates, 0.005, 0, 1, False)
         found = view.nearest(mine.templates[0], float(mine.templates[0].mean()))
         assert (found[0], found[1]) == (number, cost / 18)
+
+
+@pytest.mark.parametrize("wide", [False, True])
+def test_search_among_look_alikes_is_exact(wide):
+    """Templates that differ by less than a byte, where rounding must not decide."""
+    rows, columns = (10, 30) if wide else (3, 6)
+    config = replace(
+        WHISKER, template_x_size=columns, template_y_size=rows, vt_match_threshold=0.01
+    )
+    rng = np.random.default_rng(2)
+    base = rng.random((rows, columns))
+    view = LocalView(config)
+    for _ in range(300):
+        view.add(np.clip(base + rng.normal(0, 1e-3, (rows, columns)), 0.0, 1.0))
+    for _ in range(20):
+        query = np.clip(base + rng.normal(0, 1e-3, (rows, columns)), 0.0, 1.0)
+        number, cost, _ = oracle.match(query, view.templates, 0.015, 0, 1, False)
+        found = view.nearest(query, float(query.mean()))
+        assert (found[0], found[1]) == (number, cost / query.size)
 
 
 def test_a_uniform_search_ties_go_to_the_lowest_id():

@@ -18,6 +18,7 @@ from vibrissa.slam.metrics import (
     first_circuit,
     first_loop_closure,
     fixed_interval,
+    relocalisations,
     to_tum,
 )
 
@@ -82,6 +83,17 @@ def test_every_step_in_a_relocalised_experience_counts(ids, seed):
             entered.add(ids[i])
         expected += ids[i] in entered
     assert experience_metric(ids, poses, base).relocalised == expected
+
+
+@settings(max_examples=50, deadline=None)
+@given(ids=logs, seed=st.integers(0, 2**32 - 1), variant=variants)
+def test_verdicts_add_up_to_the_metric(ids, seed, variant):
+    poses = random_poses(np.random.default_rng(seed), len(ids), 0.15)
+    base = 1 + len(ids) // 4
+    found = experience_metric(ids, poses, base, variant=variant)
+    verdicts = relocalisations(ids, poses, base, variant=variant)
+    assert (abs(verdicts).sum(), (verdicts > 0).sum()) == (found.relocalised, found.correct)
+    assert not verdicts[:base].any()
 
 
 def test_a_perfect_revisit_with_stays_scores_one_with_or_and_less_with_and_not():

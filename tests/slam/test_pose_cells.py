@@ -172,6 +172,26 @@ def test_an_iteration_equals_the_plain_formulas(seed, step, angle, n):
     np.testing.assert_allclose(network.cells, expected, atol=1e-12)
 
 
+@pytest.mark.parametrize("exact", [False, True])
+@pytest.mark.parametrize("n", [11, 21])
+def test_many_iterations_with_far_injections_equal_the_plain_formulas(n, exact):
+    """Packets in several places, on the seams of the torus, and where the work box is closed."""
+    config = replace(IRAT, pc_dim_xy=n, faithful=exact)
+    network = PoseCells(config)
+    rng = np.random.default_rng(n)
+    expected = network.cells.copy()
+    for number in range(12):
+        if number % 3 == 0:
+            k, j, i = rng.integers(0, (36, n, n))
+            network._cells[k, j, i] += 0.3
+            network._occupied[(0, 1, 2), (k, j, i)] = 1
+            expected[k, j, i] += 0.3
+        step, angle = rng.uniform(-1, 1), rng.normal()
+        network.on_odo(step * CELL, angle, 1.0)
+        expected = oracle.move(oracle.stages(expected, 2e-5)[3], step, angle, corners=not exact)
+        np.testing.assert_allclose(network.cells, expected, atol=1e-12)
+
+
 def test_the_read_out_equals_the_plain_formula():
     network = PoseCells(IRAT)
     rng = np.random.default_rng(7)

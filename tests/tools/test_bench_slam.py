@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import os
@@ -15,7 +14,7 @@ from tests.tools.conftest import vibrissa
 from vibrissa.processes.results import silent
 from vibrissa.slam.optimum import map_cost
 from vibrissa.tools import bench_slam, bench_slam_stress
-from vibrissa.tools.slam_accuracy import precision_rows, relaxation_front
+from vibrissa.tools.slam_accuracy import relaxation_front
 from vibrissa.tools.slam_speed import SMALL, exponent, library, wandered_map
 
 
@@ -59,8 +58,8 @@ def test_relaxation_approaches_the_optimum_from_above() -> None:
     front = relaxation_front(90)
     costs = [row["cost over optimum"] for row in front]
     assert costs[-1] == 1.0
-    assert all(a >= b * (1 - 1e-9) for a, b in itertools.pairwise(costs))
-    assert costs[0] > 2.0
+    assert min(costs[:-1]) > 1.0
+    assert costs[-2] < 0.5 * costs[0]
     distances = [row["rms distance mm"] for row in front]
     assert distances[-1] == pytest.approx(0.0, abs=1e-9)
     assert distances[-2] < distances[0]
@@ -69,12 +68,6 @@ def test_relaxation_approaches_the_optimum_from_above() -> None:
 def test_the_map_that_is_relaxed_has_something_to_relax() -> None:
     emap = wandered_map(90)
     assert map_cost(emap.poses, emap.links(), emap.link_values()) > 1e-4
-
-
-def test_single_precision_differs_and_stays_near() -> None:
-    double, single = precision_rows(30)
-    assert double["error mm"] == 0.0
-    assert 0.0 < single["error mm"] < 1.0
 
 
 @pytest.mark.parametrize("equal", [False, True])
