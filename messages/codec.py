@@ -290,7 +290,7 @@ def stream_of(frame: bytes) -> tuple[bytes, int]:
             if 0xCC <= first <= 0xCE:
                 return frame[:end], int.from_bytes(frame[end + 1 : end + 1 + (1 << first - 0xCC)])
     topic, source, epoch, seq, _ = header(frame)
-    return f"{topic}\0   {source}{chr(epoch % 128)}".encode(), seq
+    return f"{topic}\0   {source}#{epoch}\0".encode(), seq
 
 
 def epoch_of(frame: bytes, topic: str, source: str) -> int:

@@ -21,7 +21,7 @@ import zmq
 from vibrissa.messages.codec import CODECS, header
 from vibrissa.messages.errors import DecodeError, MessageError
 from vibrissa.messages.transport import ZmqPort
-from vibrissa.messages.types import TICK_NS, Event, Order, Telemetry
+from vibrissa.messages.types import TICK_NS, Event, Order, Ownership, Telemetry
 from vibrissa.processes import realtime
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.control import ControlLine
@@ -32,7 +32,7 @@ from vibrissa.processes.node import Step, Stepper, counters, timer_frame
 from vibrissa.processes.receipts import ReceiptBook
 from vibrissa.processes.rehearsal import rehearse
 from vibrissa.processes.stats import Clocking
-from vibrissa.processes.table import ROWS, Process, build
+from vibrissa.processes.table import ROWS, SLOTS, Process, build
 
 HOUSEKEEPING_NS: Final = 50_000_000
 """How often receipts are handed in, so that a crash costs few."""
@@ -88,6 +88,8 @@ class Host:
             max(r.priority for r in rows) if experiment.run.realtime else 0,
             rows[0].cores,
         )
+        granted = experiment.run.realtime and "SCHED_FIFO" not in self.missing
+        self._shadow = name in SLOTS and granted
         self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self.control = ControlLine(self.context, layout.endpoints["control"], name)
         self.control.say("hello", pid=os.getpid(), missing=self.missing)
@@ -118,6 +120,8 @@ class Host:
         self._mark = 0
         self._said = 0
         self._unaccounted: list[tuple[Seat, Step, int, int, int]] = []
+        if self._shadow:
+            realtime.set_threads(0)
 
     def run(self) -> None:
         """Barrier, loop, farewell."""
@@ -233,6 +237,8 @@ class Host:
         topic = step.stream[0]
         if topic in HEEDED:
             self._heed(CODECS[topic].decode(frame).body)
+        elif topic == "head.owner" and self._shadow:
+            self._rule(CODECS[topic].decode(frame).body)
         if not (seat.answer and topic == seat.driver) or len(self._unaccounted) > LONGEST_WAIT:
             self._account()
 
@@ -250,6 +256,11 @@ class Host:
             if len(seat.book) >= RECEIPT_BATCH:
                 self._publish_own(seat.book.frame(step.t))
         self._unaccounted.clear()
+
+    def _rule(self, ownership: Ownership) -> None:
+        """A slot runs with the priority of a reflex while it has the drives, or is about to."""
+        rules = ownership.controller == self.name
+        realtime.set_threads(ROWS[self.name].priority if rules else 0)
 
     def _heed(self, body: Event | Order) -> None:
         """A stop is for everybody, a close for the slot it names."""

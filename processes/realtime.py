@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Final, Literal
 
+SHADOW_NICE: Final = -15
 _PR_SET_TIMERSLACK: Final = 29
 _PR_SET_PDEATHSIG: Final = 1
 _MCL_CURRENT_AND_FUTURE: Final = 3
@@ -37,6 +38,22 @@ def set_fifo(priority: int) -> bool:
     except (OSError, AttributeError):
         return False
     return True
+
+
+def set_threads(priority: int) -> None:
+    """Run all threads of this process under SCHED_FIFO, or with priority 0 as favoured others.
+
+    A controller in shadow that can't keep up would, under SCHED_FIFO, use up what the kernel allows
+    all such processes of a core together, and have the reflex loop suspended for it.
+    """
+    for name in os.listdir("/proc/self/task"):
+        thread = int(name)
+        with contextlib.suppress(OSError):
+            if priority:
+                os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
+            else:
+                os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
+                os.setpriority(os.PRIO_PROCESS, thread, SHADOW_NICE)
 
 
 def lock_memory() -> bool:

@@ -7,6 +7,7 @@ anything: publishers hold what it has not taken yet, and the control loop does n
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import time
@@ -23,6 +24,7 @@ from vibrissa.processes.control import ControlLine
 from vibrissa.processes.framelog import FrameLog
 from vibrissa.processes.gate import Gate
 from vibrissa.processes.layout import Layout
+from vibrissa.processes.table import RECORDER_PRIORITY
 
 SYNC_S: Final = 0.03
 DRAIN_S: Final = 0.005
@@ -34,6 +36,8 @@ class Recorder:
 
     def __init__(self, layout: Layout) -> None:
         realtime.prepare(0)
+        if json.loads(layout.experiment)["run"]["realtime"]:
+            realtime.set_fifo(RECORDER_PRIORITY)
         self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self.control = ControlLine(self.context, layout.endpoints["control"], "recorder")
         self.port = ZmqPort(

@@ -20,8 +20,10 @@ from vibrissa.processes.results import RunError
 from vibrissa.processes.table import PROCESSES, SLOTS
 
 NEXT_CYCLE: Final = "cycle"
-FRESH_PATIENCE_TICKS: Final = 2000
-"""How long a newcomer may take to answer 40 ticks in a row on time before a swap is refused."""
+PATIENCE_TICKS: Final = 2000
+"""How long, but at least a whisk cycle, a swap is asked for again while a newcomer is late ..."""
+WORTH_RETRYING: Final = ("not ready", "stale", "jump too large")
+"""... or its whiskers are elsewhere, as they are when the drives were retracted."""
 RETRY_TICKS: Final = 200
 ANSWER_PATIENCE_TICKS: Final = 20_000
 LONG: Final = ("parameters", "value")
@@ -205,19 +207,16 @@ class Requests:
         return (yield from self._switch(slot, at, False, swap.blend))
 
     def _switch(self, slot: str, at: int, at_cycle: bool, blend: float) -> Program:
-        if at_cycle:
-            period = self._run.experiment.period_ticks
-            at = (self._run.tick // period + 1) * period
-            if at - self._run.tick < 10:  # too near for the order to arrive
-                at += period
         ticks = round(blend * TICK_HZ)
-        deadline = self._run.tick + FRESH_PATIENCE_TICKS
+        patience = max(PATIENCE_TICKS, self._run.experiment.period_ticks)
+        deadline = self._run.tick + patience
         while True:
+            at = self._next_cycle() if at_cycle else at
             number = self._order("swap", "sampler", slot, at=at, blend=ticks)
             accepted, text = yield from self._answer(number)
             if accepted:
                 break
-            if not text.startswith(("not ready", "stale")) or self._run.tick > deadline:
+            if not text.startswith(WORTH_RETRYING) or self._run.tick > deadline:
                 raise RunError(f"swap to {self.slots.get(slot, slot)} refused: {text}")
             again = self._run.tick + RETRY_TICKS
             while self._run.tick < again:
@@ -226,6 +225,12 @@ class Requests:
         if not accepted:
             raise RunError(f"swap to {self.slots.get(slot, slot)} refused: {text}")
         return f"{self.slots.get(slot, slot)} ({slot}) {text}"
+
+    def _next_cycle(self) -> int:
+        """The tick at which the next whisk cycle begins for which an order is in time."""
+        period = self._run.experiment.period_ticks
+        at = (self._run.tick // period + 1) * period
+        return at if at - self._run.tick >= 10 else at + period
 
     def _rollback(self) -> Program:
         number = self._order("rollback", "sampler", "")

@@ -117,6 +117,10 @@ class Supervisor:
         self._cpu0 = 0.0
         self._wall = 0.0
 
+    def interrupt(self) -> None:
+        """End the run in order, as its operator would."""
+        self._interrupted += 1
+
     def run(self) -> dict[str, Any]:
         """The whole run. Raises RunError when it can't start; otherwise always gives a summary."""
         with self._folder() as folder, self._signals():

@@ -123,6 +123,8 @@ newcomer needs nothing from the 2 kHz loop."""
 
 ROWS: Final = PROCESSES | SLOTS
 
+RECORDER_PRIORITY: Final = 20
+"""Above ordinary work, which would starve it on a busy machine."""
 RECORDER_SILENCE: Final = 10.0
 """Seconds a recorder may be stopped before the run ends; publishers hold its messages meanwhile."""
 

@@ -37,7 +37,7 @@ from vibrissa.rig.elastica import (
     tip_result,
 )
 
-SIZE = 49
+SIZE = 57
 STEPS = 64  # of the shooting, far finer than the interpolation
 LEAST_Q = 0.1
 LEAST_HEIGHT = 0.05

@@ -84,6 +84,7 @@ BENCHES: Final[dict[str, str]] = {
     "live": "vibrissa.tools.bench_live:bench",
     "replay": "vibrissa.tools.bench_replay:bench",
     "faults": "vibrissa.tools.bench_faults:bench",
+    "swap": "vibrissa.tools.bench_swap:bench",
     "slam": "vibrissa.tools.bench_slam:bench",
     "slam-stress": "vibrissa.tools.bench_slam_stress:bench",
     "experiment": "vibrissa.tools.bench_experiment:bench",
@@ -112,6 +113,9 @@ def bench(
     quick: Annotated[
         bool, typer.Option("--quick", help="Small sizes, to see that a bench works (slam only).")
     ] = False,
+    swaps: Annotated[
+        int | None, typer.Option(min=1, help="How many swaps to make (swap only).")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Measure, and compare with what was aimed at.
@@ -120,9 +124,11 @@ def bench(
     like the others; the exit code is 0 when the measurement was made.
     """
     function = load(name)
-    if quick and "quick" not in inspect.signature(function).parameters:
-        raise typer.BadParameter(f"bench {name} has no quick form; try a short --duration")
-    options = {"quick": True} if quick else {}
+    options: dict[str, Any] = {"quick": True} if quick else {}
+    if swaps is not None:
+        options["swaps"] = swaps
+    for option in options.keys() - inspect.signature(function).parameters.keys():
+        raise typer.BadParameter(f"bench {name} has no --{option}; try a short --duration")
     with tempfile.TemporaryDirectory(prefix="vibrissa-bench-") as scratch:
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)

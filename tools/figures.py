@@ -110,7 +110,7 @@ def draw_map(data: Dataset) -> Figure:
     """The map on the maze, with experiences by the sense of the circuit that made them."""
     circuit = circuit_numbers(data.truth)
     senses = directions(data.truth, circuit)
-    figure = Figure(figsize=(11, 5.2), layout="constrained")
+    figure = Figure(figsize=(11, 6), layout="constrained")
     before, after = figure.subplots(1, 2, sharex=True, sharey=True)
     # left: the trajectory as it was estimated up to the end of the first circuit in the other sense
     other = np.flatnonzero(senses == -senses[0])

@@ -68,7 +68,7 @@ def precision_rows(steps: int) -> list[Row]:
     return [
         {
             "precision": name,
-            "us": median_us(functools.partial(network.on_odo, STEP, 0.01, 1.0), 5),
+            "us": median_us(functools.partial(network.on_odo, STEP, 0.01, 1.0), 51),
             "error mm": error,
         }
         for name, network, error in zip(("double", "single"), networks, errors, strict=True)
@@ -117,7 +117,7 @@ def followed(config: RatSlamConfig, steps: int) -> tuple[float, float, float]:
             mark = here
             active.append(np.count_nonzero(network.cells))
     rms = math.sqrt(float(np.mean(errors))) * 1e3
-    us = median_us(lambda: network.on_odo(STEP, 0.01, 1.0), 5)
+    us = median_us(lambda: network.on_odo(STEP, 0.01, 1.0), 51)
     return rms, us, float(np.mean(active))
 
 
@@ -135,7 +135,7 @@ def relaxation_front(experiences: int) -> list[Row]:
         )
         relaxed.iterate()
         rows.append(_front_row(f"{loops} sweeps", relaxed.poses, links, values, best))
-        rows[-1]["us"] = median_us(relaxed.iterate, 5)
+        rows[-1]["us"] = median_us(relaxed.iterate, 51)
     rows.append(_front_row("exact", best.poses, links, values, best) | {"us": exact_us})
     return rows
 
@@ -167,7 +167,7 @@ def pruning_rows(sizes: Sizes) -> list[Row]:
         view, unseen, seen = library(SMALL, count, equal)
         templates = view.templates.copy()
         wrong = 0
-        queries = [*unseen[: sizes.groups], *seen[: sizes.groups]]
+        queries = [*unseen[:15], *seen[:15]]
         for query in queries:
             found = view.nearest(query, float(query.mean()))
             number, cost, _ = plain.match(

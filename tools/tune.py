@@ -310,7 +310,7 @@ def print_sweep(
     console.print(rates)
     console.print(energy)
     console.print(f"chosen ({choice.stage}): {choice.reason}", markup=False)
-    console.print(toml, markup=False)
+    console.print(toml.partition("\n")[2], markup=False)
     console.print(f"{out / 'tune.png'}, {out / 'tuned.toml'}", markup=False)
 
 

@@ -25,7 +25,7 @@ from typing import Final, Self
 
 from vibrissa.rig.devices.errors import DeviceUnavailable
 
-READY_S: Final = 60.0
+READY_S: Final = 120.0
 ANSWER_S: Final = 30.0
 TICK_S: Final = 0.0005
 BACKLOG: Final = 2000

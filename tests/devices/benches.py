@@ -12,16 +12,18 @@ from pathlib import Path
 
 import numpy as np
 
+from vibrissa.control.kinematics import Float32s
 from vibrissa.rig.devices.can_emulator import CanEmulator
 from vibrissa.rig.devices.can_head import CanHead
 from vibrissa.rig.devices.emulation import EmulatorProcess, head_arguments
+from vibrissa.rig.devices.errors import DeviceUnavailable
 from vibrissa.rig.devices.head import HeadDevice, Reading
 from vibrissa.rig.devices.head_emulator import HeadEmulator
 from vibrissa.rig.devices.serial_emulator import SerialEmulator
 from vibrissa.rig.devices.serial_head import SerialHead
 from vibrissa.rig.devices.virtual_head import VirtualHead
 
-PATIENCE = 60.0
+PATIENCE = WAIT_S = 120.0
 """s; a busy machine must not make a test fail."""
 ZERO = np.zeros(18, np.float32)
 PORT = 20_000 + os.getpid() % 20_000
@@ -145,19 +147,21 @@ MAKERS = {
 }
 
 
-def readings(head: HeadDevice, seconds: float = 30.0) -> Iterator[Reading]:
-    """Readings as they come, each answered with a command of zeros; ends after so long."""
+def readings(
+    head: HeadDevice, seconds: float = WAIT_S, command: Float32s = ZERO
+) -> Iterator[Reading]:
+    """Readings as they come, each answered with a command; fails after so long."""
     until = time.monotonic() + seconds
     while time.monotonic() < until:
         reading = head.read(0.05)
         if reading is not None:
-            head.write(reading.sample, ZERO)
+            head.write(reading.sample, command)
             yield reading
     raise AssertionError(f"{head.name}: what was waited for did not come: {head.counters}")
 
 
 def wait_for(
-    head: HeadDevice, condition: Callable[[Reading], bool], seconds: float = 30.0
+    head: HeadDevice, condition: Callable[[Reading], bool], seconds: float = WAIT_S
 ) -> Reading:
     """The first reading of which something is true."""
     return next(r for r in readings(head, seconds) if condition(r))
@@ -169,12 +173,20 @@ def take(head: HeadDevice, count: int) -> list[Reading]:
     return [next(stream) for _ in range(count)]
 
 
+def opened(bench: HeadBench, patience: float) -> HeadDevice:
+    """An open head; on a busy machine it may not answer the first time."""
+    for _ in range(10):
+        with contextlib.suppress(DeviceUnavailable):
+            return bench.open(patience).open()
+    return bench.open(patience).open()
+
+
 @contextlib.contextmanager
 def streaming(bench: HeadBench, patience: float = PATIENCE) -> Iterator[HeadDevice]:
     """An open head that has begun to stream; the bench is normal again afterwards."""
     bench.ask("normal")
     try:
-        with bench.open(patience) as head:
+        with contextlib.closing(opened(bench, patience)) as head:
             take(head, 20)
             yield head
     finally:

@@ -30,14 +30,12 @@ def test_a_head_feels_the_walls_where_the_arm_carries_it(tmp_path: Path) -> None
     protracted = (0.9 * paper_head().swing).astype(np.float32)
     try:
         with streaming(bench) as head:
-            stream = readings(head, 60.0)
+            stream = readings(head, command=protracted)
             for _, reading in zip(range(600), stream, strict=False):
                 mouth.tell((0.63, 0.09, 0.4, 0.0))
-                head.write(reading.sample, protracted)
                 assert np.abs(reading.y).max() < 1e-3  # N m
             for reading in stream:  # in the corridor, between its walls
                 mouth.tell((0.63, 0.09, 0.077, 0.0))
-                head.write(reading.sample, protracted)
                 if np.abs(reading.y).max() > 1.5e-3:
                     break
     finally:

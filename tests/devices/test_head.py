@@ -9,7 +9,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from tests.devices.benches import MAKERS, ZERO, HeadBench, readings, streaming, take, wait_for
+from tests.devices.benches import (
+    MAKERS,
+    WAIT_S,
+    ZERO,
+    HeadBench,
+    readings,
+    streaming,
+    take,
+    wait_for,
+)
 from vibrissa.rig.devices import protocol
 from vibrissa.rig.devices.errors import DeviceLimit
 
@@ -50,8 +59,7 @@ def test_commands_move_the_whiskers_and_are_answered(bench: HeadBench) -> None:
     with streaming(bench) as head:
         moved: list[np.ndarray] = []
         last = -1
-        for reading in readings(head, 60.0):
-            head.write(reading.sample, command)
+        for reading in readings(head, command=command):
             assert reading.answers <= reading.sample
             assert reading.answers >= last or reading.answers == -1
             last = reading.answers
@@ -65,7 +73,7 @@ def test_commands_move_the_whiskers_and_are_answered(bench: HeadBench) -> None:
 def test_whiskers_retract_when_commands_stay_away(bench: HeadBench) -> None:
     command = np.full(18, 0.3, np.float32)
     with streaming(bench) as head:
-        until = time.monotonic() + 60.0
+        until = time.monotonic() + WAIT_S
         while time.monotonic() < until:
             reading = head.read(0.05)
             if reading is not None:
@@ -112,7 +120,7 @@ def test_it_can_be_closed_and_opened_again(bench: HeadBench) -> None:
 
 def test_reading_without_waiting_gives_what_is_there_and_no_more(bench: HeadBench) -> None:
     with streaming(bench) as head:
-        until = time.monotonic() + 20.0
+        until = time.monotonic() + WAIT_S
         while head.read(0) is not None:
             assert time.monotonic() < until
         assert wait_for(head, lambda r: True) is not None

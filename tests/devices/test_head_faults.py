@@ -48,7 +48,7 @@ def lose_some(head: HeadDevice, least: int) -> list[Reading]:
     """Readings until `least` samples more have been lost."""
     lost = head.counters.lost
     found = []
-    for reading in readings(head, 60.0):
+    for reading in readings(head):
         found.append(reading)
         if head.counters.lost >= lost + least:
             return found

@@ -98,7 +98,7 @@ class Live:
 
     def finish(self) -> dict[str, Any]:
         """End the run as its operator would."""
-        self.supervisor._interrupted += 1
+        self.supervisor.interrupt()
         self._thread.join(60)
         assert not self._thread.is_alive()
         return self.summary
