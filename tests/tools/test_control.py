@@ -132,11 +132,12 @@ def test_an_installed_controller_is_found_and_checks_its_parameters() -> None:
 
 @pytest.mark.usefixtures("installed")
 def test_an_installed_controller_is_swapped_in_and_the_log_re_runs(tmp_path: Path) -> None:
-    made = experiment(tmp_path, duration=2.4, swaps=((2, "half_amplitude"),))
+    made = experiment(tmp_path, duration=2.4, swaps=((4, "half_amplitude"),))
     summary = simulate(made, tmp_path / "run")
     got = owners(tmp_path / "run")
     assert summary["cause"] == "completed"
-    assert {got[t] for t in range(1600, made.retract_tick)} == {"whisk.1"}
+    switched = range(4 * made.period_ticks, made.retract_tick)
+    assert {got[t] for t in switched} == {"whisk.1"}
     assert identical(tmp_path / "run")
 
 
@@ -145,9 +146,9 @@ def test_a_log_whose_controller_is_not_installed_says_so(
 ) -> None:
     with monkeypatch.context() as patched:
         patched.syspath_prepend(str(site))
-        made = experiment(tmp_path, duration=1.6, swaps=((2, "half_amplitude"),))
+        made = experiment(tmp_path, duration=1.6, swaps=((4, "half_amplitude"),))
         simulate(made, tmp_path / "run")
         sys.modules.pop("half_amplitude_controller")
     outcome: Outcome = vibrissa("verify", tmp_path / "run")
     assert outcome.code == 1
-    assert "whisk.1" in outcome.err and "half_amplitude" in outcome.err
+    assert "node whisk.1" in outcome.err and "node.answer" in outcome.err
