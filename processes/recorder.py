@@ -29,6 +29,8 @@ from vibrissa.processes.table import RECORDER_PRIORITY
 SYNC_S: Final = 0.03
 DRAIN_S: Final = 0.005
 FINISH_S: Final = 5.0
+SILENCE_S: Final = 1.0
+"""How long nobody may say anything before a recorder without a supervisor closes the log."""
 
 
 class Recorder:
@@ -77,16 +79,18 @@ class Recorder:
         cause = ""
         expected: dict[str, int] | None = None
         deadline = float("inf")
+        heard = time.monotonic()
         while True:
             took = self._drain()
             now = time.monotonic()
+            heard = now if took else heard
             self.log.sync(SYNC_S)
             if now - beat > 0.1:
                 beat = now
                 steps = sum(self.log.received.values())
                 self.control.say("beat", t=self.t, steps=steps, done=False)
-                for source, (count, cause) in self.gate.take_refused().items():
-                    self.control.say("refused", source=source, count=count, cause=cause)
+                for source, (count, why) in self.gate.take_refused().items():
+                    self.control.say("refused", source=source, count=count, cause=why)
             order = self.control.hear(0)
             if order and order["kind"] == "finish":
                 cause, expected, deadline = order["cause"], order["sent"], now + FINISH_S
@@ -99,7 +103,7 @@ class Recorder:
             if now > deadline:
                 self.log.note("died", {"processes": "messages of a process were not delivered"})
                 return cause
-            if os.getppid() != self._parent and not took:
+            if os.getppid() != self._parent and now - heard > SILENCE_S:
                 return "supervisor gone"
             if not took:
                 time.sleep(DRAIN_S)
