@@ -1,10 +1,8 @@
 """The pose cells' attractor: excitation, inhibition, path integration and read-out, compiled.
 
-Source: OpenRatSLAM's PosecellNetwork. Activity is float64[heading, y, x] on a torus. `occupied`,
-uint8[3, longest axis], marks the headings, rows and columns that hold any; all work is confined to
-the marked layers and to the box of rows and columns around the marked ones, so that its cost
-follows the packet and not the grid. The Gaussian kernels are applied one axis after the other,
-which equals the three-dimensional convolution.
+Source: OpenRatSLAM's PosecellNetwork. All work is confined to the box of `packet.py` around the
+activity, so that its cost follows the packet and not the grid. The Gaussian kernels are applied one
+axis after the other, which equals the three-dimensional convolution.
 """
 
 from __future__ import annotations
@@ -13,190 +11,226 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.numerics import compiled
-from vibrissa.slam.blur import (
-    arc,
-    blur_heading,
-    blur_layer,
-    box_window,
-    dilate,
-    torus_places,
-    torus_window,
+from vibrissa.slam.blur import arc, blur_line, whole, wrapped
+from vibrissa.slam.packet import (
+    BLURRED,
+    COLUMN,
+    EXCITED,
+    EXTENT,
+    HEADING,
+    LENGTH,
+    LINES,
+    ROW,
+    SPARE,
+    START,
+    STATE,
+    close,
+    close_rows,
+    layer_size,
+    margin_of,
+    packet_reach,
+    settle,
+    shrink,
+    zero_layer,
 )
-from vibrissa.slam.path_integration import COLUMN, HEADING, ROW, integrate, read_out
+from vibrissa.slam.path_integration import integrate
+from vibrissa.slam.read_out import read_out
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
-Places = NDArray[np.uint64]
 
 
 @compiled
 def iterate(
-    cells: Floats,
-    occupied: Bytes,
     work: Floats,
-    padded: Floats,
+    box: Ints,
     excite: Floats,
     inhibit: Floats,
+    motion: Floats,
+    circle_xy: Floats,
+    circle_th: Floats,
+    best: Floats,
     global_inhibition: float,
     step: float,
     spin: float,
     iterations: int,
     faithful: bool,
-    directions: Floats,
-    circle_xy: Floats,
-    circle_th: Floats,
-    best: Floats,
 ) -> bool:
     """Iterations of the network with motion `step` (cells) and `spin` (heading cells) each.
 
-    False when no activity is left. work: float64[2, headings + 1, room for a layer], the last
-    layer zero; padded: float64[2, room for a layer]. A layer takes n + 2 radii rows of as many
-    columns.
+    work, box: as packet.py has them; motion: from motion_table; circles: from unit_circle.
+    best: receives the packet's place. False when no activity is left.
     """
-    layers = cells.shape[0]
-    n = cells.shape[1]
-    flat = cells.reshape(layers, n * n)
-    blurred, excited = work[0], work[1]
-    alive = occupied[HEADING]
-    out_radius, in_radius = excite.shape[0] - 1, inhibit.shape[0] - 1
     for _ in range(iterations):
-        top, height = arc(occupied[ROW], n)
-        left, width = arc(occupied[COLUMN], n)
-        grown_height = min(n, height + 2 * out_radius)
-        grown_width = min(n, width + 2 * out_radius)
-        top -= (grown_height - height) // 2
-        left -= (grown_width - width) // 2
-        height, width = grown_height, grown_width
-        rows = torus_places(top - out_radius, height + 2 * out_radius, n)
-        columns = torus_places(left - out_radius, width + 2 * out_radius, n)
-        window = torus_window(rows, columns, n)
-        size = height * width
-        for k in range(layers):
-            if alive[k]:
-                blur_layer(blurred[k], flat[k], window, columns.shape[0], excite, padded)
-        raised = dilate(alive, layers, out_radius)
-        for k in range(layers):
-            if raised[k]:
-                blur_heading(excited[k, :size], blurred, alive, k, excite)
-        for k in range(layers):
-            if alive[k]:
-                for p in range(out_radius, rows.shape[0] - out_radius):
-                    flat[k, rows[p] * n : rows[p] * n + n] = 0.0
-
-        kept = dilate(raised, layers, in_radius)
-        low_row, high_row, low_column, high_column = 0, height, 0, width
-        if not faithful:
-            # without negative activity inhibition only lowers: little is already nothing
-            low_row, high_row, low_column, high_column = _enough(
-                excited, raised, kept, height, width, global_inhibition
-            )
-        if high_row <= low_row:
-            return False
-        for k in range(layers):
-            if kept[k] and not raised[k]:
-                excited[k, :size] = 0.0
-        low_row -= in_radius
-        low_column -= in_radius
-        inner_height = high_row - low_row + in_radius
-        inner_width = high_column - low_column + in_radius
-        total = _inhibit(
-            excited,
-            blurred,
-            raised,
-            kept,
-            size,
-            box_window(low_row, inner_height, low_column, inner_width, height, width, n),
-            inner_width,
+        if not _once(
+            work,
+            box,
+            excite,
             inhibit,
+            motion[1 if step < 0.0 else 0],
+            circle_xy.shape[1],
             global_inhibition,
-            padded,
-        )
-        if not total > 0.0:
-            return False
-        occupied[:] = 0
-        integrate(
-            cells,
-            occupied,
-            blurred,
-            kept,
-            torus_places(top + low_row + in_radius, inner_height - 2 * in_radius, n),
-            torus_places(left + low_column + in_radius, inner_width - 2 * in_radius, n),
-            1.0 / total,
-            step,
+            abs(step),
             spin,
             faithful,
-            directions,
-        )
-    return read_out(cells, occupied, faithful, circle_xy, circle_th, best)
+        ):
+            return False
+    margin = margin_of(excite, inhibit)
+    return read_out(work[STATE], work[LINES], box, faithful, circle_xy, circle_th, best, margin)
 
 
 @compiled
-def _enough(
-    excited: Floats,
-    raised: Bytes,
-    kept: Bytes,
-    height: int,
-    width: int,
-    least: float,
-) -> tuple[int, int, int, int]:
-    """Mark the layers and bound the rows and columns where some activity reaches `least`."""
-    size = height * width
-    highest = np.zeros(size)
-    for k in range(raised.shape[0]):
-        kept[k] = 0
-        if raised[k]:
-            layer = excited[k, :size]
-            enough = 0
-            for x in range(size):
-                enough += layer[x] >= least
-                highest[x] = layer[x] if layer[x] > highest[x] else highest[x]
-            kept[k] = enough > 0
-    low_row, high_row, low_column, high_column = height, 0, width, 0
-    for j in range(height):
-        for i in range(width):
-            if highest[j * width + i] >= least:
-                low_row, high_row = min(low_row, j), j + 1
-                low_column, high_column = min(low_column, i), max(high_column, i + 1)
-    return low_row, high_row, low_column, high_column
-
-
-@compiled
-def _inhibit(
-    excited: Floats,
-    result: Floats,
-    raised: Bytes,
-    kept: Bytes,
-    size: int,
-    window: Places,
-    window_width: int,
-    weights: Floats,
+def _once(
+    work: Floats,
+    box: Ints,
+    excite: Floats,
+    inhibit: Floats,
+    motion: Floats,
+    n: int,
     global_inhibition: float,
-    padded: Floats,
-) -> float:
-    """What inhibition leaves of the kept layers within a box, and its sum.
+    speed: float,
+    spin: float,
+    faithful: bool,
+) -> bool:
+    layers = box[HEADING, EXTENT]
+    margin = margin_of(excite, inhibit)
+    reach = packet_reach(excite, inhibit, faithful)
+    source = work[settle(work, box, box.copy(), reach, margin, n)]
+    height, width = box[ROW, EXTENT], box[COLUMN, EXTENT]
+    size, stride = layer_size(box, margin), width + 2 * margin
+    nothing = zero_layer(work, n, margin, layers)
+    first = margin * stride
+    count = whole(height * stride)
+    end = first + count
+    blurred, excited, result = work[BLURRED], work[EXCITED], work[SPARE]
+    lines = work[LINES]
+    line, other = lines[:size], lines[size : 2 * size]
+    least, sums = lines[2 * size : 3 * size], lines[3 * size : 4 * size]
 
-    window: the box and a radius around it, `window_width` wide, as places in `excited`.
-    """
-    radius = weights.shape[0] - 1
-    height = window.shape[0] // window_width - 2 * radius
-    width = window_width - 2 * radius
-    sums = np.zeros(width)
-    line = np.zeros(size + 1)
-    for k in range(kept.shape[0]):
-        if not kept[k]:
+    length = box[HEADING, LENGTH]
+    for b in range(length):
+        layer = source[b * size :]
+        close_rows(layer, height, stride, margin, excite.shape[0] - 1, n)
+        blur_line(other[first:end], layer, first, stride, excite)
+        blur_line(blurred[b * size + first : b * size + end], other, first, 1, excite)
+    raised = min(layers, length + 2 * reach)
+    for e in range(raised):
+        out = excited[e * size + first : e * size + end]
+        _blur_heading(out, blurred, first, size, e - reach, length, layers, nothing, excite)
+
+    # a cell keeps what exceeds the global inhibition; in margins nothing does
+    sums[:] = 0.0
+    least[:] = np.inf
+    for j in range(margin, margin + height):
+        least[j * stride + margin : j * stride + margin + width] = global_inhibition
+    floor, total = least[first:end], sums[first:end]
+    kept = np.zeros(layers, dtype=np.uint8)
+    start = box[HEADING, START] - reach
+    for e in range(raised):
+        here = excited[e * size + first : e * size + end]
+        left = result[e * size + first : e * size + end]
+        enough = 0
+        for x in range(count):
+            enough += here[x] >= floor[x]
+        # without negative activity inhibition only lowers: little is already nothing
+        if enough == 0 and not faithful:
             continue
-        blur_heading(line[:size], excited, raised, k, weights)
-        blur_layer(result[k], line, window, window_width, weights, padded)
-        for j in range(height):
-            start = int(window[(j + radius) * window_width + radius])
-            here = excited[k, start : start + width]
-            lost = result[k, j * width : j * width + width]
-            for x in range(width):
-                value = here[x] - lost[x]
-                value = value - global_inhibition if value >= global_inhibition else 0.0
-                lost[x] = value
-                sums[x] += value
+        _blur_heading(line[first:end], excited, first, size, e, raised, layers, nothing, inhibit)
+        close(line, height, width, margin, inhibit.shape[0] - 1, n)
+        blur_line(other[first:end], line, first, stride, inhibit)
+        blur_line(left, other, first, 1, inhibit)
+        alive = 0
+        for x in range(count):
+            value = here[x] - left[x]
+            value = value - global_inhibition if value >= floor[x] else 0.0
+            left[x] = value
+            total[x] += value
+            alive += value > 0.0
+        kept[wrapped(start + e, layers)] = alive > 0
+    if not kept.any():
+        return False
+    sum_of_all = _tighten(box, sums, kept, margin, n)
+    offset = wrapped(box[HEADING, START] - start, layers)
+    for b in range(box[HEADING, LENGTH]):
+        if not kept[wrapped(box[HEADING, START] + b, layers)]:
+            e = wrapped(offset + b, layers)
+            result[e * size : (e + 1) * size] = 0.0
+    integrate(work, box, offset, 1.0 / sum_of_all, motion, speed, spin, margin, n, faithful)
+    return True
+
+
+@compiled
+def _blur_heading(
+    out: Floats,
+    volume: Floats,
+    first: int,
+    size: int,
+    at: int,
+    length: int,
+    layers: int,
+    nothing: int,
+    weights: Floats,
+) -> None:
+    """The layer `at` of the circular convolution of the `length` layers along heading."""
+    places = np.empty(7, dtype=np.int64)
+    radius = weights.shape[0] - 1
+    if radius in (2, 3):
+        for t in range(-radius, radius + 1):
+            b = wrapped(at + t, layers)
+            places[3 + t] = (b * size if b < length else nothing) + first
+        here = volume[places[3] :]
+        l1, r1 = volume[places[2] :], volume[places[4] :]
+        l2, r2 = volume[places[1] :], volume[places[5] :]
+        w0, w1, w2 = weights[0], weights[1], weights[2]
+        if radius == 2:
+            for x in range(out.shape[0]):
+                out[x] = w0 * here[x] + w1 * (l1[x] + r1[x]) + w2 * (l2[x] + r2[x])
+        else:
+            w3 = weights[3]
+            l3, r3 = volume[places[0] :], volume[places[6] :]
+            for x in range(out.shape[0]):
+                out[x] = (
+                    w0 * here[x]
+                    + w1 * (l1[x] + r1[x])
+                    + w2 * (l2[x] + r2[x])
+                    + w3 * (l3[x] + r3[x])
+                )
+        return
+    out[:] = 0.0
+    for t in range(-radius, radius + 1):
+        b = wrapped(at + t, layers)
+        if b < length:
+            w = weights[abs(t)]
+            layer = volume[b * size + first :]
+            for x in range(out.shape[0]):
+                out[x] += w * layer[x]
+
+
+@compiled
+def _tighten(box: Ints, sums: Floats, kept: Bytes, margin: int, n: int) -> float:
+    """Shrink the box to what holds activity; return the sum of all.
+
+    kept: the headings that do; sums: of all headings, a layer.
+    """
+    height, width = box[ROW, EXTENT], box[COLUMN, EXTENT]
+    stride = width + 2 * margin
+    rows = np.zeros(height, dtype=np.uint8)
+    columns = np.zeros(width, dtype=np.uint8)
+    across = np.zeros(width)
+    for j in range(height):
+        row = sums[(margin + j) * stride + margin :]
+        for x in range(width):
+            across[x] += row[x]
+        for x in range(width):
+            if row[x] > 0.0:
+                rows[j] = 1
+                break
     total = 0.0
     for x in range(width):
-        total += sums[x]
+        columns[x] = across[x] > 0.0
+        total += across[x]
+    box[HEADING, START], box[HEADING, LENGTH] = arc(kept, kept.shape[0])
+    shrink(box, ROW, rows, margin, n)
+    shrink(box, COLUMN, columns, margin, n)
     return total

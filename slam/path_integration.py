@@ -1,7 +1,7 @@
-"""Path integration and read-out of the pose cells, compiled.
+"""Path integration of the pose cells, compiled.
 
-Source: OpenRatSLAM's PosecellNetwork. Activity is float64[heading, y, x] on a torus; `occupied`,
-uint8[3, longest axis], marks the headings, rows and columns that hold any.
+Source: OpenRatSLAM's PosecellNetwork. Layer k moves along (sin, cos) of 2 pi k / layers, turned
+into the first quadrant: `up` and `right` are the ways along that quadrant's two sides.
 """
 
 from __future__ import annotations
@@ -12,191 +12,170 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.numerics import atan2, compiled, cos, sin
+from vibrissa.numerics import compiled, cos, sin
 from vibrissa.slam.angles import TAU
-from vibrissa.slam.blur import wrapped
+from vibrissa.slam.blur import whole, wrapped
+from vibrissa.slam.packet import (
+    BLURRED,
+    COLUMN,
+    EXTENT,
+    HEADING,
+    LENGTH,
+    ROW,
+    SPARE,
+    START,
+    STATE,
+    close,
+    close_columns,
+    grow,
+    layer_size,
+    memory_of,
+    zero_layer,
+)
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Bytes = NDArray[np.uint8]
 
-READOUT_HALF_WIDTH: Final = 3
-HEADING: Final = 0
-ROW: Final = 1
-COLUMN: Final = 2
-"""Rows of `occupied`."""
+UP_J: Final = (1, 0, -1, 0)
+UP_I: Final = (0, 1, 0, -1)
+RIGHT_J: Final = (0, -1, 0, 1)
+RIGHT_I: Final = (1, 0, -1, 0)
+"""`up` and `right` of each quadrant, rows and columns."""
 
 
-def unit_circle(length: int) -> Floats:
-    """float64[2, length]: sine and cosine of (n + 1) 2 pi / length, for the population vector."""
-    angles = [(n + 1) * TAU / length for n in range(length)]
-    return np.array([[sin(a) for a in angles], [cos(a) for a in angles]], dtype=np.float64)
+def motion_table(layers: int) -> Floats:
+    """float64[2, layers, 3]: forwards and backwards, (cos, sin) within the quadrant, quadrant."""
+    table = np.empty((2, layers, 3), dtype=np.float64)
+    for backwards in range(2):
+        for k in range(layers):
+            direction = k * TAU / layers + backwards * math.pi
+            quarter = math.floor(direction * 2.0 / math.pi)
+            angle = direction - quarter * (math.pi / 2.0)
+            table[backwards, k] = cos(angle), sin(angle), quarter % 4
+    return table
+
+
+@compiled
+def _move_layer(
+    moved: Floats,
+    layer: Floats,
+    box: Ints,
+    motion: Floats,
+    speed: float,
+    margin: int,
+    n: int,
+    faithful: bool,
+) -> None:
+    """One layer moved by `speed` cells, over its extent and one row more; junk in the margins.
+
+    layer: one cell around the extent must be valid, two rows above and below it.
+    """
+    height, width = box[ROW, EXTENT], box[COLUMN, EXTENT]
+    stride = width + 2 * margin
+    up, right = speed * motion[0], speed * motion[1]
+    quarter = int(motion[2])
+    both = up * right
+    to_right = right * (1.0 - up)
+    to_up = up * (1.0 - right)
+    stay = 1.0 - both - to_right - to_up
+    up_step = UP_J[quarter] * stride + UP_I[quarter]
+    right_step = RIGHT_J[quarter] * stride + RIGHT_I[quarter]
+    first = (margin - 1) * stride
+    here = layer[first:]
+    below = layer[first - up_step :]
+    aside = layer[first - right_step :]
+    corner = layer[first - up_step - right_step :]
+    out = moved[first : first + whole((height + 2) * stride)]
+    for x in range(out.shape[0]):
+        out[x] = stay * here[x] + to_up * below[x] + to_right * aside[x] + both * corner[x]
+    if not faithful:
+        return
+    # what leaves one corner of the torus upwards and the opposite one to the right is lost
+    j = n - 1 if UP_J[quarter] > RIGHT_J[quarter] else 0
+    i = n - 1 if UP_I[quarter] > RIGHT_I[quarter] else 0
+    row = memory_of(box, ROW, j + UP_J[quarter], margin, n)
+    column = memory_of(box, COLUMN, i + UP_I[quarter], margin, n)
+    if row >= 0 and column >= 0:
+        to = row * stride + column
+        moved[to] = stay * layer[to] + both * layer[to - up_step - right_step]
 
 
 @compiled
 def integrate(
-    cells: Floats,
-    occupied: Bytes,
-    source: Floats,
-    kept: Bytes,
-    rows: Ints,
-    columns: Ints,
+    work: Floats,
+    box: Ints,
+    offset: int,
     scale: float,
-    step: float,
+    motion: Floats,
+    speed: float,
     spin: float,
+    margin: int,
+    n: int,
     faithful: bool,
-    directions: Floats,
 ) -> None:
-    """Add `source` times `scale`, moved by step and spin, to the empty `cells`; mark `occupied`.
+    """Move the activity by `speed` cells and `spin` heading cells, times `scale`.
 
-    source[k, y * len(columns) + x] is the activity of the cell in rows[y], columns[x].
+    Layer b of the box is layer b + offset, on the ring of headings, of the volume SPARE; what is
+    moved is in STATE. motion: half of motion_table. The box follows.
     """
-    layers = cells.shape[0]
-    n = cells.shape[1]
-    speed = abs(step)
+    layers, length = box[HEADING, EXTENT], box[HEADING, LENGTH]
+    size = layer_size(box, margin)
+    moved = work[BLURRED]
+    back_j, on_j, back_i, on_i = 0, 0, 0, 0
+    for b in range(length):
+        k = wrapped(box[HEADING, START] + b, layers)
+        layer = work[SPARE, wrapped(offset + b, layers) * size :]
+        close(layer, box[ROW, EXTENT], box[COLUMN, EXTENT], margin, 2, n)
+        _move_layer(moved[b * size :], layer, box, motion[k], speed, margin, n, faithful)
+        quarter = int(motion[k, 2])
+        back_j = max(back_j, -UP_J[quarter], -RIGHT_J[quarter])
+        on_j = max(on_j, UP_J[quarter], RIGHT_J[quarter])
+        back_i = max(back_i, -UP_I[quarter], -RIGHT_I[quarter])
+        on_i = max(on_i, UP_I[quarter], RIGHT_I[quarter])
+    if speed > 0.0:
+        grow(box, ROW, back_j, on_j, margin, n)
+        grow(box, COLUMN, back_i, on_i, margin, n)
+    nothing = zero_layer(work, n, margin, layers)
+    _turn(work[STATE], moved, box, scale, spin, nothing, margin, n)
+
+
+@compiled
+def _turn(
+    out: Floats,
+    moved: Floats,
+    box: Ints,
+    scale: float,
+    spin: float,
+    nothing: int,
+    margin: int,
+    n: int,
+) -> None:
+    """Write the layers of `moved` times `scale`, turned by `spin` heading cells, to `out`.
+
+    nothing: where in `moved` a layer of zeros begins.
+    """
+    layers, length = box[HEADING, EXTENT], box[HEADING, LENGTH]
     sign = 1 if spin > 0.0 else -1
     turns = abs(spin)
-    low = math.floor(turns)
     high = math.ceil(turns)
     far = turns - (high - 1) if spin != 0.0 else 0.0
-    reached = np.zeros(columns.shape[0], dtype=np.uint8)
-    for k in range(layers):
-        if not kept[k]:
-            continue
-        direction = directions[k]
-        if step < 0.0:
-            direction += math.pi
-        quarter = math.floor(direction * 2.0 / math.pi)
-        angle = direction - quarter * (math.pi / 2.0)
-        quarter &= 3
-        up = speed * cos(angle)
-        right = speed * sin(angle)
-        both = up * right
-        to_right = right * (1.0 - up)
-        to_up = up * (1.0 - right)
-        stay = 1.0 - both - to_right - to_up
-        # `up` and `right` in the frame turned by `quarter` quarter turns
-        if quarter == 0:
-            up_j, up_i, right_j, right_i = 1, 0, 0, 1
-        elif quarter == 1:
-            up_j, up_i, right_j, right_i = 0, 1, -1, 0
-        elif quarter == 2:
-            up_j, up_i, right_j, right_i = -1, 0, 0, -1
-        else:
-            up_j, up_i, right_j, right_i = 0, -1, 1, 0
-        corner_j = n - 1 if up_j > right_j else 0
-        corner_i = n - 1 if up_i > right_i else 0
-        first = (k + sign * low) % layers
-        second = (k + sign * high) % layers
-        for y in range(rows.shape[0]):
-            any_here = False
-            j = rows[y]
-            j_up = wrapped(j + up_j, n)
-            j_right = wrapped(j + right_j, n)
-            j_both = wrapped(j_up + right_j, n)
-            for x in range(columns.shape[0]):
-                value = source[k, y * columns.shape[0] + x]
-                if value == 0.0:
-                    continue
-                value *= scale
-                i = columns[x]
-                i_up = wrapped(i + up_i, n)
-                i_right = wrapped(i + right_i, n)
-                i_both = wrapped(i_up + right_i, n)
-                kept_up, kept_right = 1.0, 1.0
-                if faithful:
-                    # what leaves one corner upwards and the opposite one to the right is lost
-                    if j == corner_j and i == corner_i:
-                        kept_up = 0.0
-                    if j == n - 1 - corner_j and i == n - 1 - corner_i:
-                        kept_right = 0.0
-                any_here = True
-                reached[x] = 1
-                for part in range(2):
-                    weight = (1.0 - far if part == 0 else far) * value
-                    if weight == 0.0:
-                        continue
-                    layer = first if part == 0 else second
-                    occupied[HEADING, layer] = 1
-                    cells[layer, j, i] += weight * stay
-                    cells[layer, j_up, i_up] += weight * to_up * kept_up
-                    cells[layer, j_right, i_right] += weight * to_right * kept_right
-                    cells[layer, j_both, i_both] += weight * both
-            if any_here:
-                for j_reached in (j, j_up, j_right, j_both):
-                    occupied[ROW, j_reached] = 1
-    for x in range(columns.shape[0]):
-        if reached[x]:
-            for aside in range(-1, 2):
-                occupied[COLUMN, wrapped(columns[x] + aside, n)] = 1
-
-
-@compiled
-def read_out(
-    cells: Floats,
-    occupied: Bytes,
-    faithful: bool,
-    circle_xy: Floats,
-    circle_th: Floats,
-    best: Floats,
-) -> bool:
-    """Population vector of the 7 x 7 x 7 cells around the largest one, into best (x, y, th)."""
-    layers = cells.shape[0]
-    n = cells.shape[1]
-    largest = 0.0
-    at_k, at_j, at_i = -1, -1, -1
-    for k in range(layers):
-        if not occupied[HEADING, k]:
-            continue
-        for j in range(n):
-            if not occupied[ROW, j]:
-                continue
-            for i in range(n):
-                if cells[k, j, i] > largest:
-                    largest = cells[k, j, i]
-                    at_k, at_j, at_i = k, j, i
-    if at_k < 0:
-        return False
-    half = READOUT_HALF_WIDTH
-    sum_x = np.zeros(n)
-    sum_y = np.zeros(n)
-    sum_th = np.zeros(layers)
-    for dk in range(-half, half + 1):
-        k = wrapped(at_k + dk, layers)
-        if not occupied[HEADING, k]:
-            continue
-        layer_sum = 0.0
-        for dj in range(-half, half + 1):
-            j = wrapped(at_j + dj, n)
-            row_sum = 0.0
-            for di in range(-half, half + 1):
-                i = wrapped(at_i + di, n)
-                value = cells[k, j, i]
-                sum_x[i] += value
-                row_sum += value
-            sum_y[j] += row_sum
-            layer_sum += row_sum
-        sum_th[k] += layer_sum
-    best[0] = _population_vector(sum_x, circle_xy, faithful)
-    best[1] = _population_vector(sum_y, circle_xy, faithful)
-    best[2] = _population_vector(sum_th, circle_th, faithful)
-    return True
-
-
-@compiled
-def _population_vector(sums: Floats, circle: Floats, faithful: bool) -> float:
-    """Circular mean of the cell numbers 0 .. n-1 weighted by `sums`, in [0, n)."""
-    length = float(sums.shape[0])
-    y = 0.0
-    x = 0.0
-    for i in range(sums.shape[0]):
-        y += circle[0, i] * sums[i]
-        x += circle[1, i] * sums[i]
-    value = atan2(y, x) * length / TAU - 1.0
-    while value < 0.0:
-        value += length
-    while value > length:
-        value -= length
-    if value == length and not faithful:
-        value = 0.0
-    return value
+    straight = far in (0.0, 1.0)
+    start = box[HEADING, START] + sign * (high if straight or sign < 0 else high - 1)
+    near = 1.0 if straight else (1.0 - far if sign > 0 else far)
+    here_weight, behind_weight = scale * near, scale * (1.0 - near)
+    size = layer_size(box, margin)
+    stride = box[COLUMN, EXTENT] + 2 * margin
+    first = (margin - 1) * stride
+    count = whole((box[ROW, EXTENT] + 2) * stride)
+    new_length = length if straight else min(length + 1, layers)
+    for b in range(new_length):
+        before = wrapped(b - 1, layers)
+        here = moved[(b * size if b < length else nothing) + first :]
+        behind = moved[(before * size if before < length else nothing) + first :]
+        to = out[b * size + first : b * size + first + count]
+        for x in range(count):
+            to[x] = here_weight * here[x] + behind_weight * behind[x]
+        if box[COLUMN, EXTENT] == n:
+            close_columns(out[b * size :], box[ROW, EXTENT], n, margin, margin, n)
+    box[HEADING, START] = start % layers
+    box[HEADING, LENGTH] = new_length

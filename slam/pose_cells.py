@@ -36,7 +36,16 @@ from vibrissa.slam.interface import (
     ACTION_NONE,
     SlamInputError,
 )
-from vibrissa.slam.path_integration import COLUMN, HEADING, ROW, unit_circle
+from vibrissa.slam.packet import (
+    add,
+    empty_box,
+    margin_of,
+    packet_reach,
+    working_room,
+    write_cells,
+)
+from vibrissa.slam.path_integration import motion_table
+from vibrissa.slam.read_out import unit_circle
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -67,18 +76,15 @@ class PoseCells:
         c = config
         t, n = c.pc_dim_th, c.pc_dim_xy
         self._config = c
-        self._cells = np.zeros((t, n, n), dtype=np.float64)
-        self._cells[t // 2, n // 2, n // 2] = 1.0
-        self._occupied = np.zeros((3, max(t, n)), dtype=np.uint8)
-        self._occupied[(HEADING, ROW, COLUMN), (t // 2, n // 2, n // 2)] = 1
         self._excite = half_gaussian(c.pc_w_e_dim, c.pc_w_e_var)
         self._inhibit = half_gaussian(c.pc_w_i_dim, c.pc_w_i_var)
-        room = (n + 2 * (max(c.pc_w_e_dim, c.pc_w_i_dim) // 2)) ** 2
-        self._work = np.zeros((2, t + 1, room), dtype=np.float64)
-        self._padded = np.zeros((2, room), dtype=np.float64)
-        self._angles_xy = unit_circle(n)
-        self._angles_th = unit_circle(t)
-        self._directions = np.array([k * TAU / t for k in range(t)], dtype=np.float64)
+        self._margin = margin_of(self._excite, self._inhibit)
+        self._work = working_room(n, t, self._excite, self._inhibit)
+        self._box = empty_box(t)
+        self._circle_xy = unit_circle(n)
+        self._circle_th = unit_circle(t)
+        self._motion = motion_table(t)
+        self._add(t // 2, n // 2, n // 2, 1.0)
         self._best = np.array([n // 2, n // 2, t // 2], dtype=np.float64)
         self._shift = 0.0
         # views: pose (x, y, th) and habituation, first and last experience of each
@@ -101,8 +107,11 @@ class PoseCells:
 
     @property
     def cells(self) -> Floats:
-        """Activity float64[heading, y, x] (a view)."""
-        return self._cells
+        """Activity float64[heading, y, x] (a copy)."""
+        t, n = self._config.pc_dim_th, self._config.pc_dim_xy
+        cells = np.zeros((t, n, n), dtype=np.float64)
+        write_cells(cells, self._work, self._box, self._margin)
+        return cells
 
     @property
     def best(self) -> tuple[float, float, float]:
@@ -186,21 +195,19 @@ class PoseCells:
         spin = w * dt * c.pc_dim_th / TAU
         iterations = 1 if c.faithful else max(1, math.ceil(abs(step)))
         alive = iterate(
-            self._cells,
-            self._occupied,
             self._work,
-            self._padded,
+            self._box,
             self._excite,
             self._inhibit,
+            self._motion,
+            self._circle_xy,
+            self._circle_th,
+            self._best,
             float(c.pc_global_inhib),
             step / iterations,
             spin / iterations,
             iterations,
             c.faithful,
-            self._directions,
-            self._angles_xy,
-            self._angles_th,
-            self._best,
         )
         if not alive:
             raise PoseCellError(
@@ -260,8 +267,12 @@ class PoseCells:
             i, j, k = int(x), int(y), int(th)
             if i >= n or j >= n or k >= t:
                 return
-        self._cells[k, j, i] += energy
-        self._occupied[(HEADING, ROW, COLUMN), (k, j, i)] = 1
+        self._add(k, j, i, energy)
+
+    def _add(self, k: int, j: int, i: int, energy: float) -> None:
+        c = self._config
+        reach = packet_reach(self._excite, self._inhibit, c.faithful)
+        add(self._work, self._box, (k, j, i), energy, self._margin, c.pc_dim_xy, reach)
 
     def _create(self, source: int) -> Action:
         new = self._experiences

@@ -54,7 +54,7 @@ def precision_rows(steps: int) -> list[Row]:
     """The network in single precision against double, over the same motion."""
     networks = [PoseCells(WHISKER), PoseCells(WHISKER)]
     single = networks[1]
-    for name in ("_cells", "_work", "_padded", "_excite", "_inhibit", "_best"):
+    for name in ("_work", "_excite", "_inhibit", "_best"):
         setattr(single, name, getattr(single, name).astype(np.float32))
     v, w = motion(steps)
     away = []

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.slam import oracle
+from vibrissa.slam import packet
 from vibrissa.slam.config import IRAT, WHISKER, faithful
 from vibrissa.slam.interface import SlamInputError
 from vibrissa.slam.path_integration import integrate
@@ -53,32 +54,20 @@ def settled(config, steps=60):
 
 def place(cells, activity):
     """Put a state into a network."""
-    cells._cells[:] = activity
-    cells._occupied[:] = 0
-    for marks, others in zip(cells._occupied, ((1, 2), (0, 2), (0, 1)), strict=True):
-        used = (activity != 0.0).any(axis=others)
-        marks[: len(used)] = used
+    cells._box[:, packet.LENGTH] = 0
+    for k, j, i in np.argwhere(activity).tolist():
+        cells._add(k, j, i, float(activity[k, j, i]))
 
 
 def integrated(activity, step, spin, exact):
     """One path integration of the compiled kernel."""
     cells = PoseCells(replace(IRAT, faithful=exact))
-    layers, n, _ = activity.shape
-    moved = np.zeros_like(activity)
-    integrate(
-        moved,
-        np.zeros((3, max(layers, n)), np.uint8),
-        activity.reshape(layers, n * n),
-        np.ones(layers, np.uint8),
-        np.arange(n),
-        np.arange(n),
-        1.0,
-        step,
-        spin,
-        exact,
-        cells._directions,
-    )
-    return moved
+    place(cells, activity)
+    work, box, n = cells._work, cells._box, activity.shape[1]
+    work[packet.SPARE] = work[packet.STATE]
+    motion = cells._motion[1 if step < 0.0 else 0]
+    integrate(work, box, 0, 1.0, motion, abs(step), spin, cells._margin, n, exact)
+    return cells.cells
 
 
 def test_the_oracles_kernels_and_stages_equal_openratslam():
@@ -183,8 +172,7 @@ def test_many_iterations_with_far_injections_equal_the_plain_formulas(n, exact):
     for number in range(12):
         if number % 3 == 0:
             k, j, i = rng.integers(0, (36, n, n))
-            network._cells[k, j, i] += 0.3
-            network._occupied[(0, 1, 2), (k, j, i)] = 1
+            network._add(k, j, i, 0.3)
             expected[k, j, i] += 0.3
         step, angle = rng.uniform(-1, 1), rng.normal()
         network.on_odo(step * CELL, angle, 1.0)
@@ -339,7 +327,7 @@ def test_a_view_on_a_cell_injects_there_whatever_the_last_bit_unless_faithful():
         network._best[:] = (np.nextafter(5.0, 0.0), 5.0, 18.0)
         for view in range(12):
             network.on_view_template(view)
-        network._cells[:] = 0.0
+        place(network, np.zeros((36, 11, 11)))
         network.on_view_template(0)
         assert np.argwhere(network.cells).tolist() == [[18, 5, column]]
 
