@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from vibrissa.numerics import compiled
 from vibrissa.slam.blur import arc, blur_line, whole, wrapped
 from vibrissa.slam.packet import (
+    ALIGNED,
     BLURRED,
     COLUMN,
     EXCITED,
@@ -99,7 +100,7 @@ def _once(
     source = work[settle(work, box, box.copy(), reach, margin, n)]
     height, width = box[ROW, EXTENT], box[COLUMN, EXTENT]
     size, stride = layer_size(box, margin), width + 2 * margin
-    nothing = zero_layer(work, n, margin, layers)
+    nothing = zero_layer(n, margin, layers)
     first = margin * stride
     count = whole(height * stride)
     end = first + count
@@ -109,39 +110,52 @@ def _once(
     least, sums = lines[2 * size : 3 * size], lines[3 * size : 4 * size]
 
     length = box[HEADING, LENGTH]
+    alive = np.zeros(layers, dtype=np.uint8)
     for b in range(length):
         layer = source[b * size :]
+        used = 0
+        for x in range(first, first + height * stride):
+            used += layer[x] != 0.0
+        if used == 0:
+            continue
+        alive[b] = 1
         close_rows(layer, height, stride, margin, excite.shape[0] - 1, n)
         blur_line(other[first:end], layer, first, stride, excite)
         blur_line(blurred[b * size + first : b * size + end], other, first, 1, excite)
-    raised = min(layers, length + 2 * reach)
-    for e in range(raised):
-        out = excited[e * size + first : e * size + end]
-        _blur_heading(out, blurred, first, size, e - reach, length, layers, nothing, excite)
+    # what goes along headings or cell by cell starts with a cache line
+    even = first // ALIGNED * ALIGNED
+    last = even + whole(first + height * stride - even)
+    raised = np.zeros(layers, dtype=np.uint8)
+    for e in range(min(layers, length + 2 * reach)):
+        out = excited[e * size + even : e * size + last]
+        at = wrapped(e - reach, layers)
+        raised[e] = _blur_heading(out, blurred, even, size, at, alive, nothing, excite)
 
     # a cell keeps what exceeds the global inhibition; in margins nothing does
     sums[:] = 0.0
     least[:] = np.inf
     for j in range(margin, margin + height):
         least[j * stride + margin : j * stride + margin + width] = global_inhibition
-    floor, total = least[first:end], sums[first:end]
+    floor, total = least[even:last], sums[even:last]
     kept = np.zeros(layers, dtype=np.uint8)
     start = box[HEADING, START] - reach
-    for e in range(raised):
-        here = excited[e * size + first : e * size + end]
-        left = result[e * size + first : e * size + end]
+    for e in range(min(layers, length + 2 * reach)):
+        if not (raised[e] or faithful):
+            continue
+        here = excited[e * size + even : e * size + last]
+        left = result[e * size + even : e * size + last]
         enough = 0
-        for x in range(count):
+        for x in range(here.shape[0]):
             enough += here[x] >= floor[x]
         # without negative activity inhibition only lowers: little is already nothing
         if enough == 0 and not faithful:
             continue
-        _blur_heading(line[first:end], excited, first, size, e, raised, layers, nothing, inhibit)
+        _blur_heading(line[even:last], excited, even, size, e, raised, nothing, inhibit)
         close(line, height, width, margin, inhibit.shape[0] - 1, n)
         blur_line(other[first:end], line, first, stride, inhibit)
-        blur_line(left, other, first, 1, inhibit)
+        blur_line(result[e * size + first : e * size + end], other, first, 1, inhibit)
         alive = 0
-        for x in range(count):
+        for x in range(here.shape[0]):
             value = here[x] - left[x]
             value = value - global_inhibition if value >= floor[x] else 0.0
             left[x] = value
@@ -152,11 +166,7 @@ def _once(
         return False
     sum_of_all = _tighten(box, sums, kept, margin, n)
     offset = wrapped(box[HEADING, START] - start, layers)
-    for b in range(box[HEADING, LENGTH]):
-        if not kept[wrapped(box[HEADING, START] + b, layers)]:
-            e = wrapped(offset + b, layers)
-            result[e * size : (e + 1) * size] = 0.0
-    integrate(work, box, offset, 1.0 / sum_of_all, motion, speed, spin, margin, n, faithful)
+    integrate(work, box, kept, offset, 1.0 / sum_of_all, motion, speed, spin, margin, n, faithful)
     return True
 
 
@@ -167,18 +177,24 @@ def _blur_heading(
     first: int,
     size: int,
     at: int,
-    length: int,
-    layers: int,
+    alive: Bytes,
     nothing: int,
     weights: Floats,
-) -> None:
-    """The layer `at` of the circular convolution of the `length` layers along heading."""
+) -> bool:
+    """The layer `at` of the circular convolution of the alive layers along heading, if any."""
+    layers = alive.shape[0]
     places = np.empty(7, dtype=np.int64)
     radius = weights.shape[0] - 1
+    reached = False
+    for t in range(-radius, radius + 1):
+        reached = reached or alive[wrapped(at + t, layers)] > 0
+    if not reached:
+        out[:] = 0.0
+        return False
     if radius in (2, 3):
         for t in range(-radius, radius + 1):
             b = wrapped(at + t, layers)
-            places[3 + t] = (b * size if b < length else nothing) + first
+            places[3 + t] = (b * size if alive[b] else nothing) + first
         here = volume[places[3] :]
         l1, r1 = volume[places[2] :], volume[places[4] :]
         l2, r2 = volume[places[1] :], volume[places[5] :]
@@ -196,15 +212,16 @@ def _blur_heading(
                     + w2 * (l2[x] + r2[x])
                     + w3 * (l3[x] + r3[x])
                 )
-        return
+        return True
     out[:] = 0.0
     for t in range(-radius, radius + 1):
         b = wrapped(at + t, layers)
-        if b < length:
+        if alive[b]:
             w = weights[abs(t)]
             layer = volume[b * size + first :]
             for x in range(out.shape[0]):
                 out[x] += w * layer[x]
+    return True
 
 
 @compiled

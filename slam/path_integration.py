@@ -16,6 +16,7 @@ from vibrissa.numerics import compiled, cos, sin
 from vibrissa.slam.angles import TAU
 from vibrissa.slam.blur import whole, wrapped
 from vibrissa.slam.packet import (
+    ALIGNED,
     BLURRED,
     COLUMN,
     EXTENT,
@@ -35,6 +36,7 @@ from vibrissa.slam.packet import (
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Bytes = NDArray[np.uint8]
 
 UP_J: Final = (1, 0, -1, 0)
 UP_I: Final = (0, 1, 0, -1)
@@ -104,6 +106,7 @@ def _move_layer(
 def integrate(
     work: Floats,
     box: Ints,
+    kept: Bytes,
     offset: int,
     scale: float,
     motion: Floats,
@@ -116,7 +119,8 @@ def integrate(
     """Move the activity by `speed` cells and `spin` heading cells, times `scale`.
 
     Layer b of the box is layer b + offset, on the ring of headings, of the volume SPARE; what is
-    moved is in STATE. motion: half of motion_table. The box follows.
+    moved is in STATE, and the box follows. kept: the headings that hold activity; motion: half of
+    motion_table.
     """
     layers, length = box[HEADING, EXTENT], box[HEADING, LENGTH]
     size = layer_size(box, margin)
@@ -124,6 +128,8 @@ def integrate(
     back_j, on_j, back_i, on_i = 0, 0, 0, 0
     for b in range(length):
         k = wrapped(box[HEADING, START] + b, layers)
+        if not kept[k]:
+            continue
         layer = work[SPARE, wrapped(offset + b, layers) * size :]
         close(layer, box[ROW, EXTENT], box[COLUMN, EXTENT], margin, 2, n)
         _move_layer(moved[b * size :], layer, box, motion[k], speed, margin, n, faithful)
@@ -135,8 +141,8 @@ def integrate(
     if speed > 0.0:
         grow(box, ROW, back_j, on_j, margin, n)
         grow(box, COLUMN, back_i, on_i, margin, n)
-    nothing = zero_layer(work, n, margin, layers)
-    _turn(work[STATE], moved, box, scale, spin, nothing, margin, n)
+    nothing = zero_layer(n, margin, layers)
+    _turn(work[STATE], moved, box, kept, scale, spin, nothing, margin, n)
 
 
 @compiled
@@ -144,6 +150,7 @@ def _turn(
     out: Floats,
     moved: Floats,
     box: Ints,
+    kept: Bytes,
     scale: float,
     spin: float,
     nothing: int,
@@ -165,13 +172,17 @@ def _turn(
     here_weight, behind_weight = scale * near, scale * (1.0 - near)
     size = layer_size(box, margin)
     stride = box[COLUMN, EXTENT] + 2 * margin
-    first = (margin - 1) * stride
-    count = whole((box[ROW, EXTENT] + 2) * stride)
+    end = (margin + box[ROW, EXTENT] + 1) * stride
+    first = (margin - 1) * stride // ALIGNED * ALIGNED
+    count = whole(end - first)
     new_length = length if straight else min(length + 1, layers)
+    origin = box[HEADING, START]
     for b in range(new_length):
         before = wrapped(b - 1, layers)
-        here = moved[(b * size if b < length else nothing) + first :]
-        behind = moved[(before * size if before < length else nothing) + first :]
+        alive = kept[wrapped(origin + b, layers)]
+        alive_before = kept[wrapped(origin + before, layers)]
+        here = moved[(b * size if alive else nothing) + first :]
+        behind = moved[(before * size if alive_before else nothing) + first :]
         to = out[b * size + first : b * size + first + count]
         for x in range(count):
             to[x] = here_weight * here[x] + behind_weight * behind[x]

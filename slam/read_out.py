@@ -14,6 +14,7 @@ from vibrissa.numerics import atan2, compiled, cos, sin
 from vibrissa.slam.angles import TAU
 from vibrissa.slam.blur import whole, wrapped
 from vibrissa.slam.packet import (
+    ALIGNED,
     COLUMN,
     EXTENT,
     HEADING,
@@ -100,17 +101,18 @@ def _largest(
     stride = box[COLUMN, EXTENT] + 2 * margin
     # without the margins of closed rows, which are not kept
     around = 0 if box[ROW, EXTENT] == n else 1
-    first = (margin - around) * stride
-    used = (box[ROW, EXTENT] + 2 * around) * stride
-    count = whole(used)
+    begin = (margin - around) * stride
+    end = begin + (box[ROW, EXTENT] + 2 * around) * stride
+    first = begin // ALIGNED * ALIGNED
+    count = whole(end - first)
     most = highest[:count]
     most[:] = 0.0
     for b in range(box[HEADING, LENGTH]):
         layer = state[b * size + first :]
         for x in range(count):
             most[x] = layer[x] if layer[x] > most[x] else most[x]
-    largest = most[0]
-    for x in range(1, used):
+    largest = 0.0
+    for x in range(begin - first, end - first):
         largest = most[x] if most[x] > largest else largest
     if not largest > 0.0:
         return -1, -1, -1

@@ -66,7 +66,8 @@ def integrated(activity, step, spin, exact):
     work, box, n = cells._work, cells._box, activity.shape[1]
     work[packet.SPARE] = work[packet.STATE]
     motion = cells._motion[1 if step < 0.0 else 0]
-    integrate(work, box, 0, 1.0, motion, abs(step), spin, cells._margin, n, exact)
+    kept = (activity != 0.0).any(axis=(1, 2)).astype(np.uint8)
+    integrate(work, box, kept, 0, 1.0, motion, abs(step), spin, cells._margin, n, exact)
     return cells.cells
 
 
