@@ -154,14 +154,14 @@ def _once(
         close(line, height, width, margin, inhibit.shape[0] - 1, n)
         blur_line(other[first:end], line, first, stride, inhibit)
         blur_line(result[e * size + first : e * size + end], other, first, 1, inhibit)
-        alive = 0
+        remaining = 0
         for x in range(here.shape[0]):
             value = here[x] - left[x]
             value = value - global_inhibition if value >= floor[x] else 0.0
             left[x] = value
             total[x] += value
-            alive += value > 0.0
-        kept[wrapped(start + e, layers)] = alive > 0
+            remaining += value > 0.0
+        kept[wrapped(start + e, layers)] = remaining > 0
     if not kept.any():
         return False
     sum_of_all = _tighten(box, sums, kept, margin, n)

@@ -58,8 +58,8 @@ def packet_reach(excite: Floats, inhibit: Floats, faithful: bool) -> int:
 
     In faithful mode some is negative, and what inhibition makes of that is activity.
     """
-    reach = excite.shape[0] - 1
-    return reach + inhibit.shape[0] - 1 if faithful else reach
+    reach = int(excite.shape[0] - 1)
+    return reach + int(inhibit.shape[0] - 1) if faithful else reach
 
 
 @compiled

@@ -12,8 +12,10 @@ from vibrissa.numerics import compiled
 
 UNROLLED: Final = 6
 """Cells compared per pass over a block."""
-EMPTY: Final = 32768
-"""Where the sums of a block's unused lanes start: above every sum of a used one."""
+TOGETHER: Final = 3
+"""Differences added up as bytes before they go into a sum of 16 bits: half the instructions."""
+MOST: Final = 32767
+"""No sum of differences is larger."""
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
@@ -81,7 +83,7 @@ def _apart(a: int, b: int) -> int:
 
 @compiled
 def cell_bounds(
-    mine: Bytes, under: Places, cells: Bytes, used: int, limit: int, partial: Sums, bound: Sums
+    mine: Bytes, under: Places, cells: Bytes, limit: int, partial: Sums, bound: Sums
 ) -> int:
     """Sum of the cells' differences at the best shift, for every lane; the least of them.
 
@@ -89,34 +91,34 @@ def cell_bounds(
     vector instructions on bytes.
     """
     lanes = partial.shape[0]
-    for lane in range(lanes):
-        bound[lane] = 65535
     best = np.uint16(65535)
     for shift in range(under.shape[0]):
-        for lane in range(lanes):
-            partial[lane] = 0 if lane < used else EMPTY
         least = np.uint16(0)
         for p in range(0, mine.shape[0], UNROLLED):
             m0, m1, m2 = mine[p], mine[p + 1], mine[p + 2]
             m3, m4, m5 = mine[p + 3], mine[p + 4], mine[p + 5]
             c0, c1, c2 = under[shift, p], under[shift, p + 1], under[shift, p + 2]
             c3, c4, c5 = under[shift, p + 3], under[shift, p + 4], under[shift, p + 5]
+            least = np.uint16(65535)
             for lane in range(lanes):
-                partial[lane] += (
+                three = np.uint8(
                     _apart(m0, cells[c0, lane])
                     + _apart(m1, cells[c1, lane])
                     + _apart(m2, cells[c2, lane])
-                    + _apart(m3, cells[c3, lane])
+                )
+                others = np.uint8(
+                    _apart(m3, cells[c3, lane])
                     + _apart(m4, cells[c4, lane])
                     + _apart(m5, cells[c5, lane])
                 )
-            least = np.uint16(65535)
-            for lane in range(lanes):
-                least = min(least, partial[lane])
+                so_far = partial[lane] if p > 0 else np.uint16(0)
+                total = np.uint16(so_far + np.uint16(three) + np.uint16(others))
+                partial[lane] = total
+                least = min(least, total)
             if least > limit:
                 break
         for lane in range(lanes):
-            bound[lane] = min(bound[lane], partial[lane])
+            bound[lane] = min(bound[lane], partial[lane]) if shift > 0 else partial[lane]
         best = min(best, least)
     return int(best)
 

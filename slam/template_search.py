@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 from vibrissa.numerics import compiled
 from vibrissa.slam.growing import grown
 from vibrissa.slam.template_bounds import (
-    EMPTY,
+    MOST,
+    TOGETHER,
     UNROLLED,
     best_shift,
     cell_bounds,
@@ -32,13 +33,14 @@ from vibrissa.slam.template_bounds import (
     quantise,
 )
 
-BUCKETS: Final = 1024
+BUCKETS: Final = 256
 FINE_CELLS: Final = 64
 """Templates of at most so many pixels have a cell per pixel."""
-LANES_SMALL: Final = 64
-LANES_LARGE: Final = 16
-"""Templates per block: many of few pixels, few of many."""
-BYTE: Final = 255
+LANES_SMALL: Final = 128
+LANES_LARGE: Final = 32
+"""Templates per block: few of many pixels, and enough for loops over bytes to be vectors."""
+MOST_LEVELS: Final = 255 // TOGETHER
+"""Differences of so many levels, TOGETHER of them added up, fit a byte."""
 FEW: Final = 4
 """Candidates of a block from which on the single-precision costs are worth computing."""
 SINGLE_EPSILON: Final = 1.2e-7
@@ -74,7 +76,7 @@ class TemplateIndex:
         compared = columns - 2 * self._margin
         shifts = range(0, columns if panoramic else 2 * self._margin + 1, step)
         x, group = np.arange(compared), np.arange(groups)[:, None]
-        used = min(groups * max(compared, 0), EMPTY - 1)
+        used = min(groups * max(compared, 0), MOST)
         padded = -(-used // UNROLLED) * UNROLLED
         # which cell of a template lies under each compared cell of the view, for every shift;
         # the padding compares the view's 0 with the cell behind the last one, which stays 0
@@ -82,7 +84,7 @@ class TemplateIndex:
         self._under = np.full((len(shifts), padded), groups * columns, dtype=np.uint64)
         for row, shift in zip(self._under, shifts, strict=True):
             row[:used] = (group * columns + (x + shift) % columns).ravel()[:used]
-        self._levels = min(BYTE, (EMPTY - 1) // max(used, 1))
+        self._levels = min(MOST_LEVELS, MOST // max(used, 1))
         self._rounding = 0.0
         self._scratch = np.zeros(groups * columns, dtype=np.uint8)
         # blocks of templates of one bucket, chained from `first` to `tail`
@@ -130,7 +132,8 @@ class TemplateIndex:
         lane = int(self._filled[block])
         self._ids[block, lane] = new
         rounding = quantise(template, self._rows_per_cell, self._levels, self._scratch)
-        self._cells[block, :-1, lane] = self._scratch
+        # unused lanes repeat a template, so that they never bound the sums of a block
+        self._cells[block, :-1, lane:] = self._scratch[:, np.newaxis]
         self._rounding = max(self._rounding, rounding)
         if self._pixels.size:
             self._pixels[block, :, :, lane] = template
@@ -253,7 +256,7 @@ def _search(
         block = first[bucket]
         while block >= 0:
             used = filled[block]
-            if cell_bounds(mine, under, cells[block], used, limit, partial, bound) <= limit:
+            if cell_bounds(mine, under, cells[block], limit, partial, bound) <= limit:
                 nearest = 0
                 survivors = 0
                 for lane in range(used):
@@ -299,4 +302,4 @@ def _search(
 @compiled
 def _limit(cost: float, levels_per_cost: float, doubt: float) -> int:
     """The largest cell sum of a template whose cost is at most `cost`."""
-    return int(min(cost * levels_per_cost * (1.0 + 1e-12) + doubt + 1e-6, EMPTY - 1.0))
+    return int(min(cost * levels_per_cost * (1.0 + 1e-12) + doubt + 1e-6, float(MOST)))
