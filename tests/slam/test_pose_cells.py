@@ -181,6 +181,47 @@ def test_many_iterations_with_far_injections_equal_the_plain_formulas(n, exact):
         np.testing.assert_allclose(network.cells, expected, atol=1e-12)
 
 
+@settings(max_examples=100, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    n=st.integers(1, 24),
+    layers=st.integers(1, 40),
+    widths=st.tuples(st.sampled_from([1, 3, 5, 7, 9]), st.sampled_from([1, 3, 5, 7, 9])),
+    step=st.floats(-1.0, 1.0),
+    exact=st.booleans(),
+)
+def test_any_grid_and_any_kernels_equal_the_plain_formulas(seed, n, layers, widths, step, exact):
+    """Grids smaller than the kernels, packets that leave gaps, boxes that open and close."""
+    rng = np.random.default_rng(seed)
+    config = replace(
+        IRAT,
+        pc_dim_xy=n,
+        pc_dim_th=layers,
+        pc_w_e_dim=widths[0],
+        pc_w_i_dim=widths[1],
+        pc_w_i_var=3,
+        faithful=exact,
+    )
+    network = PoseCells(config)
+    expected = network.cells
+    excite, inhibit = oracle.kernel(widths[0], 1), oracle.kernel(widths[1], 3)
+    for number in range(5):
+        if number % 2 == 0:
+            k, j, i = rng.integers(0, (layers, n, n)).tolist()
+            network._add(k, j, i, 0.5)
+            expected[k, j, i] += 0.5
+        angle = float(rng.normal())
+        excited = oracle.convolve(expected, excite)
+        left = excited - oracle.convolve(excited, inhibit)
+        kept = np.where(left >= config.pc_global_inhib, left - config.pc_global_inhib, 0.0)
+        if not kept.sum() > 1e-6:
+            # nothing to compare: the network inhibits itself, or all that is left is rounding
+            return
+        network.on_odo(step * CELL, angle, 1.0)
+        expected = oracle.move(kept / kept.sum(), step, angle, corners=not exact)
+        np.testing.assert_allclose(network.cells, expected, atol=1e-12)
+
+
 def test_the_read_out_equals_the_plain_formula():
     network = PoseCells(IRAT)
     rng = np.random.default_rng(7)
