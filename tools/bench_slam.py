@@ -123,7 +123,9 @@ def targets(speeds: Rows, relaxation: Rows, pruning: Rows) -> list[Target]:
         ("pose cells 11x11x36", 40.0),
         ("pose cells 11x11x36", 15.0),
         ("18 pixels, 10000 templates, spread", 15.0),
+        ("18 pixels, 10000 templates, equal", 15.0),
         ("18 pixels, 100000 templates, spread", 100.0),
+        ("18 pixels, 100000 templates, equal", 100.0),
     )
     made = [Target(name, us[name], "us", "<=", aim) for name, aim in aims if name in us]
     made += [

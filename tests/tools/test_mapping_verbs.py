@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from evo.core import metrics as evo_metrics
+from evo.tools import file_interface
 
 from tests.tools.conftest import Outcome, refused, rewrite, vibrissa
 from tests.tools.mapping import PLACES, SENSES, write_log
@@ -231,10 +233,6 @@ def test_export_writes_three_trajectories(mapped: Path, tmp_path: Path) -> None:
 
 
 def test_exported_trajectories_are_what_evo_reads(mapped: Path, tmp_path: Path) -> None:
-    pytest.importorskip("evo", reason="the extra 'crosscheck' is not installed")
-    from evo.core import metrics as evo_metrics
-    from evo.tools import file_interface
-
     vibrissa("export", mapped, "--tum", tmp_path)
     paths = [
         file_interface.read_tum_trajectory_file(tmp_path / f"{name}.tum")
