@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 from vibrissa.numerics import atan2, compiled, cos, sin
 from vibrissa.rig import elastica
 from vibrissa.rig.beam_table import (
-    LEAST_HEIGHT,
+    LEAST_FIRST,
     LEAST_Q,
-    interpolate,
+    MOST_FIRST,
+    interpolate_peg,
+    interpolate_tip,
     most_gamma,
     peg_table,
     tip_table,
@@ -30,6 +32,7 @@ from vibrissa.rig.beam_table import (
 FORMS = ("linear", "table", "exact")
 LINEAR, TABLE, EXACT = range(3)
 EXACT_STEPS = elastica.STEPS
+LEAST_HEIGHT, MOST_HEIGHT = math.cos(MOST_FIRST), math.cos(LEAST_FIRST)
 
 
 def beam_tables(ratios: tuple[float, ...], size: int) -> NDArray[np.float64]:
@@ -51,12 +54,12 @@ def peg(
         return moment, arc, angle, rests
     row = (q - LEAST_Q) / (1.0 - LEAST_Q)
     if form == LINEAR:
-        _one, bow, slope = interpolate(tables[0], row, 0.0)
+        _one, bow, slope = interpolate_peg(tables[0], row, 0.0)
         return 3.0 * q * gamma, 1.0 + bow * gamma * gamma, slope * gamma, True
     share = gamma / most_gamma(tables[0], row)
     if share > 1.0:
         return 0.0, 1.0, 0.0, False
-    part, bow, slope = interpolate(tables[0], row, 1.0 - math.sqrt(1.0 - share * share))
+    part, bow, slope = interpolate_peg(tables[0], row, 1.0 - math.sqrt(1.0 - share * share))
     return 3.0 * q * gamma * part, 1.0 + bow * gamma * gamma, slope * gamma, True
 
 
@@ -70,12 +73,12 @@ def tip(
     the length L; turn: angle between straight shaft and plane normal, rad, less than at first
     touch. Moment in E I0 / L, lengths in L. Turns below 0 count as 0.
     """
-    height = min(max(height, LEAST_HEIGHT), 1.0 - 1e-7)
+    height = min(max(height, LEAST_HEIGHT), MOST_HEIGHT)
     first = atan2(math.sqrt(1.0 - height * height), height)
     turned = min(max(first - turn, 0.0), first)
     if form == LINEAR:
         # The chord shortens by c gamma^2 and its end stays on the plane.
-        _one, c, _slope = interpolate(tables[0], (r - LEAST_Q) / (1.0 - LEAST_Q), 0.0)
+        _one, c, _slope = interpolate_peg(tables[0], (r - LEAST_Q) / (1.0 - LEAST_Q), 0.0)
         gamma = turned
         for _ in range(4):
             chord = 1.0 - c * gamma * gamma
@@ -89,6 +92,5 @@ def tip(
         moment, offset, arc, found = elastica.tip_contact(r, height, first - turned, EXACT_STEPS)
         if found:
             return moment, offset, arc
-    row = (height - LEAST_HEIGHT) / (1.0 - LEAST_HEIGHT)
-    share, bearing, arc = interpolate(tables[table], row, turned / first)
+    share, bearing, arc = interpolate_tip(tables[table], first, turned)
     return 3.0 * r * turned * share / height, height * sin(bearing) / cos(bearing), arc

@@ -8,11 +8,14 @@ interpolation. Two kinds:
   equilibrium exists and the shaft slides off. There the moment falls like a square root; in s it
   is smooth. Entries: moment over the small-angle one; (arc length - 1) / gamma^2; angle of the
   shaft at the contact over gamma; gamma_most. Valid for every shaft: only q tells them apart.
-- tip on a plane, one for each tip over base diameter: rows height, the distance of the base from
-  the plane over the length, from LEAST_HEIGHT to 1; columns (first - turn) / first, with first the
-  angle to the plane's normal at which the straight shaft touches. Entries: moment over the
-  small-angle one, times height; angle of the line from base to contact to the normal, rad; arc
-  length to the contact over the length.
+- tip on a plane, one for each tip over base diameter: rows `first`, the angle to the plane's normal
+  at which the straight shaft touches, from LEAST_FIRST to MOST_FIRST (a plane a length or a
+  twentieth of it away); columns the angle turned since, up to a push straight at the plane. Where
+  the tip comes to lie along the plane the answer has a kink. It runs along the middle column of the
+  second half of the rows; in the first half it isn't reached, and only the first half of the
+  columns is in use. Entries: moment over the small-angle one, times height; angle of the line from
+  base to contact to the normal, rad; arc length to the contact over the length; angle turned at the
+  middle column over first; the border between the halves, rad, in the last column of the first row.
 
 Built with the project's own arithmetic only, so the bits are the same on every machine.
 """
@@ -25,24 +28,30 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.numerics import atan2, compiled
+from vibrissa.numerics import atan2, compiled, cos
 from vibrissa.rig.elastica import (
+    LYING,
     PEG,
     TIP,
     follow_tip,
     last_peg,
+    lying_force,
     peg_between,
     shoot,
     solve,
+    straight_push,
+    tip_lying,
     tip_result,
 )
+
+Float64s = NDArray[np.float64]
 
 SIZE = 57
 STEPS = 64  # of the shooting, far finer than the interpolation
 LEAST_Q = 0.1
-LEAST_HEIGHT = 0.05
+LEAST_FIRST, MOST_FIRST = 1e-3, 1.5207754699891267  # rad; acos(0.05)
 MOMENT, ARC, ANGLE, MOST = range(4)  # of the peg table
-BEARING, ARC_LENGTH = 1, 2  # of a tip table, besides MOMENT
+BEARING, ARC_LENGTH, MIDDLE = 1, 2, 3  # of a tip table, besides MOMENT
 
 
 @compiled
@@ -74,28 +83,59 @@ def _peg_row(q: float, row: NDArray[np.float64], steps: int) -> None:
 
 
 @compiled
-def _tip_row(r: float, height: float, row: NDArray[np.float64], steps: int) -> None:
-    """Fill one row float64[SIZE, 4] of a tip table."""
-    size = row.shape[0]
-    first = atan2(math.sqrt(1.0 - height * height), height)
+def _tip_row(r: float, first: float, most_force: float, row: Float64s, steps: int) -> None:
+    """Fill one row float64[SIZE, 4] of a tip table.
+
+    most_force: that of a tip which lies down as the push is straight; 0 where it never does.
+    """
+    half = row.shape[0] // 2
+    height, middle, lying = cos(first), first, 0.0
+    if most_force > 0.0:
+        lying = lying_force(r, height, most_force, steps)
+        middle = first - tip_lying(r, lying, steps)[1]
     kind, force, rest, turned = TIP, 0.0, first - 0.5 * math.pi, 0.0
-    for n in range(size):
-        to = first * (n / (size - 1) if n > 0 else 1e-3)
-        kind, force, rest, _found = follow_tip(
-            r, height, first, turned, to, kind, force, rest, steps
-        )
+    for n in range(row.shape[0] if most_force > 0.0 else half + 1):
+        if n <= half:
+            to = middle * (n / half if n > 0 else 1e-3)
+        else:
+            to = middle + (first - middle) * ((n - half) / half)
+        if n == half and most_force > 0.0:
+            kind, force, rest = LYING, lying, 1.0
+        elif to > turned:
+            kind, force, rest, _found = follow_tip(
+                r, height, first, turned, to, kind, force, rest, steps
+            )
         turned = to
         moment, offset, arc = tip_result(r, kind, force, rest, steps)
         row[n, MOMENT] = moment * height / (3.0 * r * to)
         row[n, BEARING] = atan2(offset, height)
         row[n, ARC_LENGTH] = arc
     row[0, MOMENT], row[0, BEARING], row[0, ARC_LENGTH] = height, first, 1.0
+    row[:, MIDDLE] = middle / first
+
+
+@compiled
+def _tip_rows(r: float, table: Float64s, steps: int) -> None:
+    size = table.shape[0]
+    half = size // 2
+    most_force = straight_push(r, steps)
+    straight = tip_lying(r, most_force, steps)[0]
+    border = atan2(math.sqrt(1.0 - straight * straight), straight)
+    for n in range(half + 1):
+        first = LEAST_FIRST + (border - LEAST_FIRST) * (n / half)
+        _tip_row(r, first, 0.0, table[n], steps)
+    for n in range(1, half + 1):
+        first = border + (MOST_FIRST - border) * (n / half)
+        _tip_row(r, first, most_force, table[half + n], steps)
+    for n in range(half + 1, size):
+        table[half, n] = table[half, half]
+    table[0, size - 1, MIDDLE] = border
 
 
 @lru_cache(maxsize=8)
 def peg_table(size: int = SIZE) -> NDArray[np.float64]:
-    """The peg table, float64[size, size, 4], read-only."""
-    table = np.empty((size, size, 4), dtype=np.float64)
+    """The peg table, float64[size, size, 4], read-only; size: odd and at least 7."""
+    table = _empty(size)
     for n in range(size):
         _peg_row(LEAST_Q + (1.0 - LEAST_Q) * n / (size - 1), table[n], STEPS)
     table.setflags(write=False)
@@ -105,24 +145,30 @@ def peg_table(size: int = SIZE) -> NDArray[np.float64]:
 @lru_cache(maxsize=64)
 def tip_table(r: float, size: int = SIZE) -> NDArray[np.float64]:
     """The table of a tip on a plane, float64[size, size, 4], read-only; r: tip over base."""
-    table = np.zeros((size, size, 4), dtype=np.float64)
-    for n in range(size):
-        height = LEAST_HEIGHT + (1.0 - LEAST_HEIGHT) * n / (size - 1)
-        _tip_row(r, min(height, 1.0 - 1e-7), table[n], STEPS)
+    table = _empty(size)
+    _tip_rows(r, table, STEPS)
     table.setflags(write=False)
     return table
 
 
+def _empty(size: int) -> NDArray[np.float64]:
+    if size < 7 or size % 2 == 0:
+        raise ValueError(f"beam table: expected an odd size of at least 7, found {size}")
+    return np.zeros((size, size, 4), dtype=np.float64)
+
+
 @compiled
 def interpolate(
-    table: NDArray[np.float64], row: float, column: float
+    table: Float64s, rows: tuple[int, int], row: float, columns: tuple[int, int], column: float
 ) -> tuple[float, float, float]:
-    """The first three entries at (row, column), each from 0 to 1 and clipped to that."""
-    size = table.shape[0]
-    y = min(max(row, 0.0), 1.0) * (size - 1)
-    x = min(max(column, 0.0), 1.0) * (size - 1)
-    i, j = min(max(int(y) - 1, 0), size - 4), min(max(int(x) - 1, 0), size - 4)
-    a, b = _weights(y - i), _weights(x - j)
+    """The first three entries, in the part of a table between nodes ``rows`` and ``columns``.
+
+    rows, columns: (first, last), at least 3 apart; row, column: where between them, from 0 to 1 and
+    clipped to that.
+    """
+    i, y = _stencil(rows, row)
+    j, x = _stencil(columns, column)
+    a, b = _weights(y), _weights(x)
     p = q = r = 0.0
     for k in range(4):
         u = v = w = 0.0
@@ -137,15 +183,52 @@ def interpolate(
 
 
 @compiled
-def most_gamma(table: NDArray[np.float64], row: float) -> float:
-    """Entry MOST of the peg table at a row from 0 to 1, clipped to that."""
-    size = table.shape[0]
-    y = min(max(row, 0.0), 1.0) * (size - 1)
-    i = min(max(int(y) - 1, 0), size - 4)
-    a = _weights(y - i)
-    total: float = a[0] * table[i, 0, MOST] + a[1] * table[i + 1, 0, MOST]
-    total += a[2] * table[i + 2, 0, MOST] + a[3] * table[i + 3, 0, MOST]
+def interpolate_peg(table: Float64s, row: float, column: float) -> tuple[float, float, float]:
+    """The first three entries of the peg table, row and column from 0 to 1 and clipped to that."""
+    whole = (0, table.shape[0] - 1)
+    return interpolate(table, whole, row, whole, column)
+
+
+@compiled
+def interpolate_tip(table: Float64s, first: float, turned: float) -> tuple[float, float, float]:
+    """The first three entries of a tip table, by angles in rad, 0 <= turned <= first."""
+    last = table.shape[0] - 1
+    half = last // 2
+    border = table[0, last, MIDDLE]
+    left, right = (0, half), (half, last)
+    if first < border:
+        row = (first - LEAST_FIRST) / (border - LEAST_FIRST)
+        return interpolate(table, left, row, left, turned / first)
+    row = (first - border) / (MOST_FIRST - border)
+    middle = first * interpolate_row(table, right, row)
+    if turned < middle:
+        return interpolate(table, right, row, left, turned / middle)
+    return interpolate(table, right, row, right, (turned - middle) / max(first - middle, 1e-9))
+
+
+@compiled
+def interpolate_row(table: Float64s, rows: tuple[int, int], row: float) -> float:
+    """The fourth entry, which is the same in all columns but for those out of use."""
+    i, y = _stencil(rows, row)
+    a = _weights(y)
+    total: float = a[0] * table[i, 0, 3] + a[1] * table[i + 1, 0, 3]
+    total += a[2] * table[i + 2, 0, 3] + a[3] * table[i + 3, 0, 3]
     return total
+
+
+@compiled
+def most_gamma(table: Float64s, row: float) -> float:
+    """Entry MOST of the peg table at a row from 0 to 1, clipped to that."""
+    return interpolate_row(table, (0, table.shape[0] - 1), row)
+
+
+@compiled
+def _stencil(nodes: tuple[int, int], at: float) -> tuple[int, float]:
+    """First of the four nodes around a place between two nodes, and the place counted from it."""
+    first, last = nodes
+    x = min(max(at, 0.0), 1.0) * (last - first)
+    i = min(max(int(x) - 1, 0), last - first - 3)
+    return first + i, x - i
 
 
 @compiled

@@ -278,6 +278,50 @@ def follow_tip(
 
 
 @compiled
+def tip_lying(r: float, force: float, steps: int) -> tuple[float, float]:
+    """A tip that just comes to lie along its plane: (height, turn) for a force on it.
+
+    r: tip over base diameter. With the force the height grows and the turn falls, down to 0.
+    """
+    _x, y, theta = shoot(1.0 - r, 1.0, force, 0.0, steps)
+    return y, 0.5 * math.pi - theta
+
+
+@compiled
+def straight_push(r: float, steps: int) -> float:
+    """The force that lays the tip along a plane as the whisker is pushed straight at it.
+
+    With less, the tip lies down at an angle to the push. By bisection.
+    """
+    high = 0.01
+    while tip_lying(r, high, steps)[1] > 0.0:
+        high *= 1.25
+    low = 0.8 * high
+    while True:
+        force = 0.5 * (low + high)
+        if force in (low, high):
+            return low
+        if tip_lying(r, force, steps)[1] > 0.0:
+            low = force
+        else:
+            high = force
+
+
+@compiled
+def lying_force(r: float, height: float, most: float, steps: int) -> float:
+    """The force, less than ``most``, that lays the tip along a plane at a height. By bisection."""
+    low, high = 0.0, most
+    while True:
+        force = 0.5 * (low + high)
+        if force in (low, high):
+            return force
+        if tip_lying(r, force, steps)[0] < height:
+            low = force
+        else:
+            high = force
+
+
+@compiled
 def tip_result(
     r: float, kind: int, force: float, rest: float, steps: int
 ) -> tuple[float, float, float]:

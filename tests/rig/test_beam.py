@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc
 
-from vibrissa.rig.beam import EXACT, LINEAR, TABLE, beam_tables, peg, tip
-from vibrissa.rig.beam_table import LEAST_HEIGHT, most_gamma, peg_table, tip_table
+from vibrissa.rig.beam import EXACT, LEAST_HEIGHT, LINEAR, TABLE, beam_tables, peg, tip
+from vibrissa.rig.beam_table import most_gamma, peg_table, tip_table
 from vibrissa.rig.elastica import STEPS, dead_load, last_peg, peg_contact, shoot, tip_contact
 from vibrissa.rig.whisker import slip_coefficient
 
