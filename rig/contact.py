@@ -271,12 +271,14 @@ def from_inside(
     toward = sin_phi * slope
     side = math.sqrt(max(1.0 - toward * toward, 0.0))
     tip_angle, tip_y, tip_x, tip_holds, through_edge = phi, 0.0, 0.0, False, 0.0
+    hangs = False  # the shaft lies along the face and on the edge, its tip behind the wall
     if side > 1e-9 and cos_phi > 0.0:
         turn = atan2(side, toward)
-        moment, offset, _arc = tip(
+        moment, offset, arc = tip(
             form, tables, table, 1.0 - taper * length, distance / length, turn
         )
         depth = offset * length * cos_phi / side
+        hangs = depth + (1.0 - arc) * length * cos_phi / side >= drop > depth
         if depth >= drop and offset > 0.0:
             tip_holds, tip_angle = True, atan2(near, depth)
             tip_y = -moment / length * cos_phi * slope / side
@@ -304,9 +306,9 @@ def from_inside(
                 through_face = (length - arc * arm) * max(dip, 0.0)
     if tip_holds and not (edge_holds and through_edge > 0.0):
         return ON_FACE, tip_angle, tip_y, tip_x
-    if not edge_holds or (through_face > 0.0 and not tip_holds):
+    if not edge_holds or (through_face > 0.0 and not (tip_holds or hangs)):
         return PAST, phi, 0.0, 0.0
-    if through_face == 0.0:
+    if through_face == 0.0 or hangs:
         return ON_EDGE, edge_angle, edge_y, edge_x
     share = through_edge / (through_edge + through_face)
     return (

@@ -158,7 +158,8 @@ def test_interpolated_tip_is_within_a_thousandth_of_full_scale(table: int, ratio
     moderate = np.array(moments) < 2 * full_scale
     assert moderate.mean() > 0.6
     assert np.array(errors)[moderate].max() < 1e-3 * full_scale
-    assert np.quantile(offsets, 0.98) < 1e-3
+    assert np.array(errors).max() < 1e-3 * max(moments)
+    assert max(offsets) < 1e-4
 
 
 def test_tables_are_the_same_however_often_they_are_built() -> None:

@@ -22,6 +22,7 @@ from vibrissa.rig.contact import (
     wall_angles,
     wall_side,
 )
+from vibrissa.rig.elastica import STEPS, tip_contact
 
 LENGTH, TAPER, DROP = 0.11, (1 - 0.4 / 1.3) / 0.11, 0.057
 TABLES = beam_tables((0.4 / 1.3,), 49)
@@ -85,9 +86,10 @@ def test_whisker_coming_down_meets_the_edge_then_slips_onto_the_top_and_past_it(
 
 
 def test_whisker_coming_up_behind_a_wall_is_held_by_its_face_and_comes_free() -> None:
+    near = 0.085
     seen, moments = [], []
-    for phi in np.arange(0.6, 1.3, 1e-3):
-        what, _, y, x = inside(phi, 0.085)
+    for phi in np.arange(0.6, 1.5, 1e-3):
+        what, _, y, x = inside(phi, near)
         assert x == 0.0 and y <= 0.0
         moments.append(-y)
         if not seen or seen[-1] != what:
@@ -96,6 +98,13 @@ def test_whisker_coming_up_behind_a_wall_is_held_by_its_face_and_comes_free() ->
             break
     assert seen == [FREE, ON_FACE, PAST]
     assert np.abs(np.diff(moments)[:-1]).max() < 0.02 * max(moments)
+    # Bent by the face, the tip lags far behind the straight shaft: it rises over the wall's top at
+    # the angle at which the exact solution has it there.
+    last, next_ = (
+        tip_contact(1 - TAPER * LENGTH, near / LENGTH, math.pi / 2 - angle, STEPS)[1] * LENGTH
+        for angle in (phi - 2e-3, phi)
+    )
+    assert last > DROP and next_ < DROP + 1e-5
 
 
 def test_contact_close_to_the_pivot_passes_from_face_to_edge_without_a_jump() -> None:
@@ -103,6 +112,7 @@ def test_contact_close_to_the_pivot_passes_from_face_to_edge_without_a_jump() ->
         uy = -math.sqrt(1 - ux * ux)
         found = [inside(phi, 0.020, ux, uy) for phi in np.arange(0.2, 1.0, 5e-4)]
         what = [entry[0] for entry in found]
+        assert PAST not in what[what.index(ON_FACE) :]
         held = [entry for entry in found if entry[0] in (ON_FACE, ON_EDGE)]
         assert ON_FACE in what and ON_EDGE in what
         force = np.hypot([entry[2] for entry in held], [entry[3] for entry in held])
