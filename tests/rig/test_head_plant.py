@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from vibrissa.control.kinematics import NOSE_HEIGHT, WHISKERS
 from vibrissa.numerics import compiled
 from vibrissa.rig import rows as h
-from vibrissa.rig.beam import EXACT, peg
+from vibrissa.rig.beam import EXACT, peg, tip
 from vibrissa.rig.head import POSE_LIMIT, TICK, vibrate
 from vibrissa.rig.head_params import head_table
 from vibrissa.rig.maze import load_maze
 from vibrissa.rig.plant import WATCHDOG_TICKS, HeadPlant, HeadPlantParams, PlantError
-from vibrissa.rig.rows import RIGIDITY, TAPER, WEIGHT
+from vibrissa.rig.rows import LENGTH, RIGIDITY, TAPER, WEIGHT
 from vibrissa.rig.scene import build_scene, wall_boxes
 from vibrissa.rig.sensing import DRIFT_TICKS
 
@@ -42,7 +42,7 @@ def ring(state, memo, table, ticks):
         vibrate(state, memo, table)
 
 
-def whisking(plant: HeadPlant, tick: int, share: float = 1.0) -> np.ndarray:
+def whisking(plant: HeadPlant, tick: float, share: float = 1.0) -> np.ndarray:
     angle = share * plant.params.geometry.swing * (1 - math.cos(2 * math.pi * tick / WHISK)) / 2
     return angle.astype(np.float32)
 
@@ -137,21 +137,34 @@ def test_noise_has_the_given_spread_and_no_bias() -> None:
 
 @pytest.mark.parametrize("params", [CYLINDERS, QUIET])
 def test_contact_moment_is_the_elastica_s(params: HeadPlantParams) -> None:
+    # Eight times slower than a whisk: what inertia adds is then far below what is compared.
     plant = HeadPlant(wall_across(0.060), 1, params)
-    theta, x, y = run(plant, lambda t: ORIGIN, WHISK // 2)
+    slow = [whisking(plant, 0.125 * t) for t in range(4 * WHISK)]
+    samples = [plant.step(t, ORIGIN, command) for t, command in enumerate(slow)]
+    theta, x, y = (np.array(channel) for channel in zip(*samples, strict=True))
     far, drop = 0.072, 0.107 - 0.050
     d, touch = math.hypot(far, drop), math.atan2(far, drop)
     gamma = touch - (plant.params.geometry.phi_start[MID_LEFT] - theta[:, MID_LEFT])
     table = head_table(params)
     q = 1 - table[TAPER, MID_LEFT] * d
     beam = plant.model.beam
-    unit = np.array([peg(EXACT, beam, q, max(g, 0.0))[0] for g in gamma])
-    moment = table[RIGIDITY, MID_LEFT] * unit / d
+    moment = []
+    for phi in touch - gamma[::20]:
+        unit, _, angle, _ = peg(EXACT, beam, q, max(touch - phi, 0.0))
+        moment.append(unit / d)
+        if phi + angle > math.pi / 2:  # the shaft has come to lie along the wall's top
+            end, length = (
+                1 - table[TAPER, MID_LEFT] * table[LENGTH, MID_LEFT],
+                table[LENGTH, MID_LEFT],
+            )
+            unit, _, _ = tip(EXACT, beam, 0, end, drop / length, phi)
+            moment[-1] = unit / length
+    moment = table[RIGIDITY, MID_LEFT] * np.array(moment)
     felt = (y - weight_term(plant, theta))[:, MID_LEFT]
     assert moment.max() > 5e-4
-    np.testing.assert_allclose(felt, moment, atol=2e-6)
+    np.testing.assert_allclose(felt[::20], moment, atol=1e-3 * moment.max())
     before, after = np.flatnonzero(gamma < -1e-3), np.flatnonzero(gamma > 1e-2)
-    assert np.abs(felt[before]).max() < 2e-5
+    assert np.abs(felt[before]).max() < 2e-6
     assert (np.diff(felt[after]) > 0).sum() > 0.95 * (len(after) - 1)
     assert np.abs(x[:, MID_LEFT]).max() < 1e-6
 
@@ -457,7 +470,8 @@ def test_friction_drags_the_shaft_along_a_wall_and_is_off_by_default() -> None:
             pose = (0.05 * TICK * s, 0.0, NOSE_HEIGHT, 0.0)
             samples.append([v[MID_LEFT] for v in plant.step(t, pose, command)])
         felt[mu] = np.array(samples, dtype=np.float64)
-    assert not felt[0.0][:, 1].any()
+    # Nothing but the rounding of the azimuth, whose cosine is 6e-17.
+    assert np.abs(felt[0.0][:, 1]).max() < 1e-18
     x, y = felt[0.3][:, 1], felt[0.0][:, 2]
     load = (y - weight_term(plant, felt[0.0][:, :1])[:, MID_LEFT])[1400]
     assert np.abs(x[:1499]).max() < 1e-9
@@ -468,22 +482,32 @@ def test_friction_drags_the_shaft_along_a_wall_and_is_off_by_default() -> None:
     np.testing.assert_allclose(x[3600:3900], -0.3 * load, rtol=0.05)
 
 
-def test_rate_of_ticks_changes_little() -> None:
-    felt = {}
-    for rate in (1000, 2000, 8000):
+def test_rate_of_ticks_changes_less_than_the_noise() -> None:
+    # The same commands, a thousand a second, and samples at the same times.
+    felt, pegs = {}, {}
+    for rate in (1000, 2000, 4000, 16000):
         params = HeadPlantParams(
             rate=float(rate), encoder_noise=0.0, sensor_noise=0.0, sensor_resolution=0.0
         )
         plant = HeadPlant(wall_across(0.060), 1, params)
-        y = []
+        per_ms = rate // 1000
+        y, peg_of = [], []
         for t in range(rate // 2):
-            share = (1 - math.cos(2 * math.pi * t / rate)) / 2
-            command = (share * plant.params.geometry.swing).astype(np.float32)
-            y.append(plant.step(t, ORIGIN, command)[2])
-        felt[rate] = np.array(y)[:: rate // 1000][-400:]
-    coarse = np.abs(felt[1000] - felt[8000]).max()
-    fine = np.abs(felt[2000] - felt[8000]).max()
-    assert fine < 0.6 * coarse and fine < 1e-5
+            _, _, sampled = plant.step(t, ORIGIN, whisking(plant, 2 * (t // per_ms)))
+            if t % per_ms == per_ms - 1:
+                y.append(sampled)
+                peg_of.append(plant.state[h.PEG].copy())
+        felt[rate], pegs[rate] = np.array(y), np.array(peg_of)
+    fine = pegs[16000]
+    touches = (fine >= 0).any(axis=0)
+    lets_go = ((fine[:-1] >= 0) & (fine[1:] < 0)).any(axis=0)
+    assert touches.sum() > 2 and lets_go.any() and (touches & ~lets_go).any()
+    error = {r: np.abs(felt[r] - felt[16000])[:, ~lets_go].max() for r in (1000, 2000, 4000)}
+    noise = HeadPlantParams().sensor_noise
+    assert error[2000] < 0.5 * noise and error[4000] < 0.5 * error[2000] < 0.25 * error[1000]
+    # A whisker slips off within a tick of the right one.
+    for rate in (1000, 2000, 4000):
+        assert (pegs[rate] != fine).sum(axis=0).max() <= 1
 
 
 numbers = st.floats(-POSE_LIMIT, POSE_LIMIT)
