@@ -60,7 +60,7 @@ def wall_across(near: float, thickness: float = 0.012) -> np.ndarray:
 
 
 def weight_term(plant: HeadPlant, theta: np.ndarray) -> np.ndarray:
-    return -head_table(plant.params)[WEIGHT] * np.sin(plant.params.geometry.phi_start - theta)
+    return -plant.model.head[WEIGHT] * np.sin(plant.params.geometry.phi_start - theta)
 
 
 def strolling(t: int) -> tuple[float, float, float, float]:
