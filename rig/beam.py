@@ -92,5 +92,5 @@ def tip(
         moment, offset, arc, found = elastica.tip_contact(r, height, first - turned, EXACT_STEPS)
         if found:
             return moment, offset, arc
-    share, bearing, arc = interpolate_tip(tables[table], first, turned)
-    return 3.0 * r * turned * share / height, height * sin(bearing) / cos(bearing), arc
+    share, offset, arc = interpolate_tip(tables[table], height, first, turned)
+    return 3.0 * r * turned * share / height, offset, arc

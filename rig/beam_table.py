@@ -13,9 +13,9 @@ interpolation. Two kinds:
   twentieth of it away); columns the angle turned since, up to a push straight at the plane. Where
   the tip comes to lie along the plane the answer has a kink. It runs along the middle column of the
   second half of the rows; in the first half it isn't reached, and only the first half of the
-  columns is in use. Entries: moment over the small-angle one, times height; angle of the line from
-  base to contact to the normal, rad; arc length to the contact over the length; angle turned at the
-  middle column over first; the border between the halves, rad, in the last column of the first row.
+  columns is in use. Entries: moment over the small-angle one, times height; offset of the contact
+  along the plane over offset + height; arc length to it over the length; angle turned at the middle
+  column over first. The border between the halves, rad, is in the last column of the first row.
 
 Built with the project's own arithmetic only, so the bits are the same on every machine.
 """
@@ -28,7 +28,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.numerics import atan2, compiled, cos
+from vibrissa.numerics import atan2, compiled, cos, sin
 from vibrissa.rig.elastica import (
     LYING,
     PEG,
@@ -51,7 +51,7 @@ STEPS = 64  # of the shooting, far finer than the interpolation
 LEAST_Q = 0.1
 LEAST_FIRST, MOST_FIRST = 1e-3, 1.5207754699891267  # rad; acos(0.05)
 MOMENT, ARC, ANGLE, MOST = range(4)  # of the peg table
-BEARING, ARC_LENGTH, MIDDLE = 1, 2, 3  # of a tip table, besides MOMENT
+OFFSET, ARC_LENGTH, MIDDLE = 1, 2, 3  # of a tip table, besides MOMENT
 
 
 @compiled
@@ -108,9 +108,10 @@ def _tip_row(r: float, first: float, most_force: float, row: Float64s, steps: in
         turned = to
         moment, offset, arc = tip_result(r, kind, force, rest, steps)
         row[n, MOMENT] = moment * height / (3.0 * r * to)
-        row[n, BEARING] = atan2(offset, height)
+        row[n, OFFSET] = offset / (offset + height)
         row[n, ARC_LENGTH] = arc
-    row[0, MOMENT], row[0, BEARING], row[0, ARC_LENGTH] = height, first, 1.0
+    row[0, MOMENT], row[0, ARC_LENGTH] = height, 1.0
+    row[0, OFFSET] = sin(first) / (sin(first) + height)
     row[:, MIDDLE] = middle / first
 
 
@@ -190,20 +191,27 @@ def interpolate_peg(table: Float64s, row: float, column: float) -> tuple[float, 
 
 
 @compiled
-def interpolate_tip(table: Float64s, first: float, turned: float) -> tuple[float, float, float]:
-    """The first three entries of a tip table, by angles in rad, 0 <= turned <= first."""
+def interpolate_tip(
+    table: Float64s, height: float, first: float, turned: float
+) -> tuple[float, float, float]:
+    """(moment over the small-angle one, times height; offset; arc length) from a tip table.
+
+    height: of the base over the length, cos(first); first, turned: rad, 0 <= turned <= first.
+    """
     last = table.shape[0] - 1
     half = last // 2
     border = table[0, last, MIDDLE]
     left, right = (0, half), (half, last)
-    if first < border:
-        row = (first - LEAST_FIRST) / (border - LEAST_FIRST)
-        return interpolate(table, left, row, left, turned / first)
-    row = (first - border) / (MOST_FIRST - border)
-    middle = first * interpolate_row(table, right, row)
-    if turned < middle:
-        return interpolate(table, right, row, left, turned / middle)
-    return interpolate(table, right, row, right, (turned - middle) / max(first - middle, 1e-9))
+    rows, columns = left, left
+    row, column = (first - LEAST_FIRST) / (border - LEAST_FIRST), turned / first
+    if first >= border:
+        rows, row = right, (first - border) / (MOST_FIRST - border)
+        middle = first * interpolate_row(table, right, row)
+        column = turned / middle
+        if turned >= middle:
+            columns, column = right, (turned - middle) / max(first - middle, 1e-9)
+    moment, share, arc = interpolate(table, rows, row, columns, column)
+    return moment, height * share / (1.0 - share), arc
 
 
 @compiled

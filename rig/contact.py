@@ -235,10 +235,9 @@ def from_above(
         offset = far / length
     elif (offset + 1.0 - arc) * length < near:
         return PAST, phi, 0.0, 0.0
-    angle = atan2(offset, height)
-    if angle <= phi:
+    if moment <= 0.0:
         return FREE, phi, 0.0, 0.0
-    return ON_FACE, angle, moment / length, 0.0
+    return ON_FACE, max(atan2(offset, height), phi), moment / length, 0.0
 
 
 @compiled

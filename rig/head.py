@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vibrissa.control.kinematics import WHISKERS
 from vibrissa.numerics import compiled, cos, sin
 from vibrissa.rig.rows import (
     ACCELERATION,
@@ -28,15 +29,15 @@ from vibrissa.rig.rows import (
     COS_PHI,
     COUNTS,
     CROSS_TALK,
-    DRIFT_STEP,
     DRIFT_X,
-    DRIFT_Y,
     DT,
     ENCODER_NOISE,
     FIRST_QQ,
+    FROM_PHI,
     FROM_X,
     FROM_Y,
     FROM_YAW,
+    FROM_Z,
     FULL_SCALE,
     GAMMA,
     INERTIA,
@@ -46,6 +47,7 @@ from vibrissa.rig.rows import (
     MOMENT_Y,
     OMEGA,
     PEG,
+    PHI,
     PHI_START,
     PIVOT_HEIGHT,
     PIVOT_RADIUS,
@@ -58,6 +60,7 @@ from vibrissa.rig.rows import (
     RING_X2,
     RING_Y,
     RING_Y2,
+    ROOM,
     SENSOR_NOISE,
     SERVO_EE,
     SERVO_EW,
@@ -73,6 +76,7 @@ from vibrissa.rig.rows import (
     THETA_HIGH,
     THETA_LOW,
     WEIGHT,
+    at,
 )
 from vibrissa.rig.scene import GRID_TOP
 from vibrissa.rig.sensing import DRIFT_TICKS, PAIRS, drift, measured, normals
@@ -81,6 +85,7 @@ from vibrissa.rig.touch import LEAST_DROP, clear_of, look_around, touch
 TICK = 0.0005  # s, unless the head table has another
 QUIET = 1e-14  # N m, where a vibration has died away
 STILL = 1e-30  # rad/s, where a servo stands
+IN_VECTORS = 24  # whiskers, with some of no meaning that fill the last vector
 
 OK, COMMAND_NOT_FINITE, POSE_OUT_OF_RANGE = range(3)
 POSE_LIMIT = 1e4
@@ -105,27 +110,30 @@ def drive(
     command: NDArray[np.float32],
     silent: bool,
 ) -> None:
-    """Advance every servo by one tick; fills in the ACCELERATION of the memo."""
-    for i in range(state.shape[1]):
-        low, high = head[THETA_LOW, i], head[THETA_HIGH, i]
-        aim = state[COMMAND, i]
-        step = head[RETRACT_STEP, i]
+    """Advance every servo by one tick; fills in ACCELERATION and PHI .. COS_PHI of the memo.
+
+    state, memo and head as one row each, see `at`.
+    """
+    for i in range(WHISKERS):
+        low, high = head[at(THETA_LOW, i)], head[at(THETA_HIGH, i)]
+        aim = state[at(COMMAND, i)]
+        step = head[at(RETRACT_STEP, i)]
         back = aim - min(max(aim, -step), step)
         aim = back if silent else min(max(float(command[i]), low), high)
-        state[COMMAND, i] = aim
+        state[at(COMMAND, i)] = aim
 
-        dt = head[DT, i]
+        dt = head[at(DT, i)]
         # The contact is a spring that answers within the tick, so that no stiffness is too much.
-        gamma, moment = state[GAMMA, i], state[MOMENT_Y, i]
+        gamma, moment = state[at(GAMMA, i)], state[at(MOMENT_Y, i)]
         spring = moment / gamma if abs(gamma) > 1e-9 else 0.0
-        compliance, ee = head[COMPLIANCE, i], head[SERVO_EE, i]
-        old_theta, old_omega = state[THETA, i], state[OMEGA, i]
+        compliance, ee = head[at(COMPLIANCE, i)], head[at(SERVO_EE, i)]
+        old_theta, old_omega = state[at(THETA, i)], state[at(OMEGA, i)]
         follow = (1.0 - ee) * compliance * spring
         goal = (1.0 - ee) * (aim - compliance * moment) + ee * old_theta
-        theta = (goal + head[SERVO_EW, i] * old_omega + follow * old_theta) / (1.0 + follow)
+        theta = (goal + head[at(SERVO_EW, i)] * old_omega + follow * old_theta) / (1.0 + follow)
         target = aim - compliance * (moment + spring * (theta - old_theta))
-        omega = head[SERVO_WE, i] * (old_theta - target) + head[SERVO_WW, i] * old_omega
-        limit = head[SPEED_LIMIT, i]
+        omega = head[at(SERVO_WE, i)] * (old_theta - target) + head[at(SERVO_WW, i)] * old_omega
+        limit = head[at(SPEED_LIMIT, i)]
         fast = abs(omega) > limit or abs(theta - old_theta) > limit * dt
         pace = math.copysign(limit, theta - old_theta)
         omega = pace if fast else omega
@@ -133,14 +141,13 @@ def drive(
         inside = low <= theta <= high
         omega = omega if inside and abs(omega) > STILL else 0.0
         theta = min(max(theta, low), high)
-        state[THETA, i], state[OMEGA, i] = theta, omega
-        memo[ACCELERATION, i] = (omega - old_omega) * head[RATE, i]
-    theta_row, start = state[THETA], head[PHI_START]
-    sines, cosines = memo[SIN_PHI], memo[COS_PHI]
-    for i in range(state.shape[1]):
-        sines[i] = sin(start[i] - theta_row[i])
-    for i in range(state.shape[1]):
-        cosines[i] = cos(start[i] - theta_row[i])
+        state[at(THETA, i)], state[at(OMEGA, i)] = theta, omega
+        memo[at(ACCELERATION, i)] = (omega - old_omega) * head[at(RATE, i)]
+        memo[at(PHI, i)] = head[at(PHI_START, i)] - theta
+    for i in range(IN_VECTORS):
+        memo[at(SIN_PHI, i)] = sin(memo[at(PHI, i)])
+    for i in range(IN_VECTORS):
+        memo[at(COS_PHI, i)] = cos(memo[at(PHI, i)])
 
 
 @compiled
@@ -149,21 +156,24 @@ def vibrate(
 ) -> None:
     """Advance both modes of every shaft, in both directions, by one tick.
 
-    In y they ring about what the turning base does to the shaft's inertia.
+    In y they ring about what the turning base does to the shaft's inertia. Arguments as for
+    `drive`.
     """
     for axis in range(2):
         for mode in range(2):
             row, step = RING_X + 4 * axis + 2 * mode, FIRST_QQ + 4 * mode
-            for i in range(state.shape[1]):
-                share = head[SWAY, i] if mode == 0 else 1.0 - head[SWAY, i]
-                rest = share * head[INERTIA, i] * memo[ACCELERATION, i] if axis == 1 else 0.0
-                a, v = state[row, i] - rest, state[row + 1, i]
-                b = head[step, i] * a + head[step + 1, i] * v
-                w = head[step + 2, i] * a + head[step + 3, i] * v
+            for i in range(WHISKERS):
+                share = head[at(SWAY, i)] if mode == 0 else 1.0 - head[at(SWAY, i)]
+                rest = 0.0
+                if axis == 1:
+                    rest = share * head[at(INERTIA, i)] * memo[at(ACCELERATION, i)]
+                a, v = state[at(row, i)] - rest, state[at(row + 1, i)]
+                b = head[at(step, i)] * a + head[at(step + 1, i)] * v
+                w = head[at(step + 2, i)] * a + head[at(step + 3, i)] * v
                 # Died away: subnormal numbers would be slow.
                 rings = abs(b) >= QUIET or abs(w) >= QUIET
-                state[row, i] = rest + b if rings else rest
-                state[row + 1, i] = w if rings else 0.0
+                state[at(row, i)] = rest + b if rings else rest
+                state[at(row + 1, i)] = w if rings else 0.0
 
 
 @compiled
@@ -177,24 +187,28 @@ def sense(
     x_out: NDArray[np.float32],
     y_out: NDArray[np.float32],
 ) -> None:
-    """Sample every encoder and deflection sensor into float32[18], rad and N m."""
-    whiskers = state.shape[1]
+    """Sample every encoder and deflection sensor into float32[18], rad and N m.
+
+    state, memo and head as for `drive`.
+    """
     if tick % DRIFT_TICKS == 0:
-        drift(state[DRIFT_X : DRIFT_Y + 1], head[DRIFT_STEP], seed, tick)
+        drift(state, head, seed, tick)
     noise, uniforms = np.empty(2 * PAIRS, dtype=np.float64), np.empty(2 * PAIRS, dtype=np.float64)
     normals(seed, tick, uniforms, noise)
-    for i in range(whiskers):
-        x = state[MOMENT_X, i] + (state[RING_X, i] + state[RING_X2, i])
-        y = state[MOMENT_Y, i] + (state[RING_Y, i] + state[RING_Y2, i])
-        y -= head[WEIGHT, i] * memo[SIN_PHI, i]
-        mixed_x = x + head[CROSS_TALK, i] * y + state[DRIFT_X, i]
-        mixed_y = y + head[CROSS_TALK, i] * x + state[DRIFT_Y, i]
-        mixed_x += head[SENSOR_NOISE, i] * noise[whiskers + i]
-        mixed_y += head[SENSOR_NOISE, i] * noise[2 * whiskers + i]
-        theta_out[i] = state[THETA, i] + head[ENCODER_NOISE, i] * noise[i]
-        full_scale, counts = head[FULL_SCALE, i], head[COUNTS, i]
-        x_out[i] = measured(mixed_x, full_scale, counts, head[RESOLUTION, i])
-        y_out[i] = measured(mixed_y, full_scale, counts, head[RESOLUTION, i])
+    for i in range(WHISKERS):
+        theta_out[i] = state[at(THETA, i)] + head[at(ENCODER_NOISE, i)] * noise[i]
+    for axis in range(2):
+        out = y_out if axis == 1 else x_out
+        for i in range(WHISKERS):
+            x = state[at(MOMENT_X, i)] + (state[at(RING_X, i)] + state[at(RING_X2, i)])
+            y = state[at(MOMENT_Y, i)] + (state[at(RING_Y, i)] + state[at(RING_Y2, i)])
+            y -= head[at(WEIGHT, i)] * memo[at(SIN_PHI, i)]
+            own, other = (y, x) if axis == 1 else (x, y)
+            mixed = own + head[at(CROSS_TALK, i)] * other + state[at(DRIFT_X + axis, i)]
+            mixed += head[at(SENSOR_NOISE, i)] * noise[at(1 + axis, i)]
+            out[i] = measured(
+                mixed, head[at(FULL_SCALE, i)], head[at(COUNTS, i)], head[at(RESOLUTION, i)]
+            )
 
 
 @compiled
@@ -222,23 +236,23 @@ def head_step(
     Returns OK, or COMMAND_NOT_FINITE or POSE_OUT_OF_RANGE with nothing changed.
     """
     head, beam, boxes, grid, starts, items = model
-    whiskers = state.shape[1]
     for k in range(4):
         if not abs(pose[k]) <= POSE_LIMIT:
             return POSE_OUT_OF_RANGE
     if not silent:
-        for i in range(whiskers):
+        for i in range(WHISKERS):
             if not math.isfinite(command[i]):
                 return COMMAND_NOT_FINITE
-    drive(state, memo, head, command, silent)
+    flat_state, flat_memo, flat_head = state.reshape(-1), memo.reshape(-1), head.reshape(-1)
+    drive(flat_state, flat_memo, flat_head, command, silent)
     cos_yaw, sin_yaw = cos(pose[3]), sin(pose[3])
     still = True
     for k in range(4):
         still = still and memo[POSE, k] == pose[k]
         memo[POSE, k] = pose[k]
     top = grid[GRID_TOP]
-    for i in range(whiskers):
-        phi = head[PHI_START, i] - state[THETA, i]
+    for i in range(WHISKERS):
+        phi = memo[PHI, i]
         length = head[LENGTH, i]
         pz = max(pose[2] + head[PIVOT_HEIGHT, i], LEAST_DROP)
         free = state[PEG, i] < 0.0 and state[SIDE, i] == 0.0
@@ -250,9 +264,11 @@ def head_step(
                     + abs(pose[1] - memo[FROM_Y, i])
                     + abs(pose[3] - memo[FROM_YAW, i]) * (head[PIVOT_RADIUS, i] + length)
                 )
+                turned = max(abs(phi - memo[FROM_PHI, i]), abs(state[PSI, i] - memo[FROM_PHI, i]))
+                beside = moved + abs(pose[2] - memo[FROM_Z, i]) + turned * length < memo[ROOM, i]
                 away = moved < memo[MARGIN, i]
                 drop = pz if away else max(pz - top, LEAST_DROP)
-                if clear_of(length, angle, drop):
+                if beside or clear_of(length, angle, drop):
                     state[PSI, i] = phi
                     memo[SETTLED, i] = 0.0
                     continue
@@ -265,7 +281,7 @@ def head_step(
         if skip and still:
             for k in range(CONTACT_ROWS):
                 memo[BEFORE + k, i] = state[PSI + k, i]
-        met = touch(
+        touch(
             state,
             i,
             head,
@@ -290,8 +306,25 @@ def head_step(
                 for k in range(CONTACT_ROWS):
                     settled = settled and memo[BEFORE + k, i] == state[PSI + k, i]
             memo[SETTLED, i], memo[SETTLED_PHI, i] = 1.0 if settled else 0.0, phi
-            if met == 0 and state[PEG, i] < 0.0 and state[SIDE, i] == 0.0:
-                look_around(memo, i, head, boxes, grid, starts, items, pose, px, py, ux, uy)
-    vibrate(state, memo, head)
-    sense(state, memo, head, seed, tick, theta_out, x_out, y_out)
+            if state[PEG, i] < 0.0 and state[SIDE, i] == 0.0:
+                look_around(
+                    memo,
+                    i,
+                    head,
+                    boxes,
+                    grid,
+                    starts,
+                    items,
+                    pose,
+                    px,
+                    py,
+                    pz,
+                    ux,
+                    uy,
+                    phi,
+                    memo[SIN_PHI, i],
+                    memo[COS_PHI, i],
+                )
+    vibrate(flat_state, flat_memo, flat_head)
+    sense(flat_state, flat_memo, flat_head, seed, tick, theta_out, x_out, y_out)
     return OK

@@ -1,5 +1,10 @@
 """What the rows of the head's arrays hold; their columns are the whiskers."""
 
+from __future__ import annotations
+
+from vibrissa.compilation import inlined
+from vibrissa.control.kinematics import WHISKERS
+
 # Rows of the shaft table float64[SHAFT_ROWS, whiskers].
 (
     LENGTH,  # m
@@ -86,16 +91,32 @@ STATE_ROWS = 26
 # Rows of the memo float64[MEMO_ROWS, 18]. A fresh memo of zeros knows nothing.
 (
     POSE,  # the pose of the last tick, in the first four columns
-    MARGIN,  # m, how far every point of the whisker was from the next box ...
+    MARGIN,  # m, how far from the next box every point was that the whisker can reach ...
+    ROOM,  # ... and how far from the next box or the floor every point of the whisker was ...
     FROM_X,  # ... when the head was here
     FROM_Y,
+    FROM_Z,
     FROM_YAW,
+    FROM_PHI,  # ... and the whisker there
     SETTLED,  # 1 where the last evaluation left the state as it was ...
     SETTLED_PHI,  # ... at this angle
     ACCELERATION,  # rad/s^2, of this tick
+    PHI,  # rad; each of these three has a row to spare behind it, for loops over whole vectors
+    _,
     SIN_PHI,
+    _,
     COS_PHI,
+    _,
     BEFORE,  # first of the rows that keep the contact's state of before an evaluation
-) = range(11)
+) = range(18)
 CONTACT_ROWS = HELD_Y + 1 - PSI
 MEMO_ROWS = BEFORE + CONTACT_ROWS
+
+
+@inlined
+def at(row: int, whisker: int) -> int:
+    """Where an entry of these arrays is when they are read as one row.
+
+    With the number of columns known, loops over whiskers turn into vector instructions.
+    """
+    return row * WHISKERS + whisker

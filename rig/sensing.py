@@ -1,7 +1,8 @@
 """What the encoders and deflection sensors report: noise, drift, cross-talk, counts, clipping.
 
-Noise is a function of (seed, tick): 54 normal draws from fourteen blocks of random bits, made for
-all whiskers at once. Nothing draws from a sequence, so skipped work never shifts it.
+Noise is a function of (seed, tick): 64 normal draws from sixteen blocks of random bits, made for
+all whiskers at once; 54 are used, and whole vectors take less time than fewer would. Nothing draws
+from a sequence, so skipped work never shifts it.
 """
 
 from __future__ import annotations
@@ -11,9 +12,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from vibrissa.control.kinematics import WHISKERS
 from vibrissa.numerics import compiled, cos, log, philox4x32, philox_normals4, sin
+from vibrissa.rig.rows import DRIFT_STEP, DRIFT_X, DRIFT_Y, at
 
-BLOCKS = 14  # of four 32-bit words, each pair of words gives two normals
+BLOCKS = 16  # of four 32-bit words, each pair of words gives two normals
 PAIRS = 2 * BLOCKS
 DRIFT_TICKS = 200
 DRIFT_STREAM = 32  # first noise stream of the drift; those below are the blocks of a tick
@@ -21,9 +24,9 @@ DRIFT_STREAM = 32  # first noise stream of the drift; those below are the blocks
 
 @compiled
 def normals(seed: int, tick: int, uniforms: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-    """56 independent standard normals, |z| < 6.8, by the method of Box and Muller.
+    """64 independent standard normals, |z| < 6.8, by the method of Box and Muller.
 
-    uniforms: float64[56], overwritten; out: float64[56].
+    uniforms: float64[64], overwritten; out: float64[64].
     """
     for n in range(BLOCKS):
         w0, w1, w2, w3 = philox4x32(tick, tick >> 32, n, 0, seed, seed >> 32)
@@ -42,12 +45,12 @@ def normals(seed: int, tick: int, uniforms: NDArray[np.float64], out: NDArray[np
 
 
 @compiled
-def drift(bias: NDArray[np.float64], step: NDArray[np.float64], seed: int, tick: int) -> None:
-    """Random walk of the biases float64[2, whiskers] (x, y), N m, by ``step`` float64[whiskers]."""
-    for i in range(bias.shape[1]):
+def drift(state: NDArray[np.float64], head: NDArray[np.float64], seed: int, tick: int) -> None:
+    """Random walk of the biases DRIFT_X and DRIFT_Y; state and head as one row each, see `at`."""
+    for i in range(WHISKERS):
         walk_x, walk_y, _, _ = philox_normals4(seed, DRIFT_STREAM + i, tick)
-        bias[0, i] += step[i] * walk_x
-        bias[1, i] += step[i] * walk_y
+        state[at(DRIFT_X, i)] += head[at(DRIFT_STEP, i)] * walk_x
+        state[at(DRIFT_Y, i)] += head[at(DRIFT_STEP, i)] * walk_y
 
 
 @compiled

@@ -28,9 +28,11 @@ from vibrissa.rig.rows import (
     FACE,
     FORM,
     FRICTION,
+    FROM_PHI,
     FROM_X,
     FROM_Y,
     FROM_YAW,
+    FROM_Z,
     GAMMA,
     HELD_X,
     HELD_Y,
@@ -46,6 +48,7 @@ from vibrissa.rig.rows import (
     RING_X2,
     RING_Y,
     RING_Y2,
+    ROOM,
     SIDE,
     SIDE_BOX,
     SIDE_LEAN,
@@ -56,6 +59,8 @@ from vibrissa.rig.rows import (
 from vibrissa.rig.scene import GRID_REACH, TOP, index_cell
 
 LEAST_DROP = 0.001  # m, a pivot is taken to be at least this far above a wall's top
+MOST_ROOM = 0.02  # m, what is nearer to a wall's height counts as being beside it
+SLACK = 1e-6  # m, far above what rounding and the tables' ends can move
 MOST_LEAN = 2.0  # a whisker bent further sideways than this comes free in any case
 
 
@@ -88,12 +93,12 @@ def touch(
     phi: float,
     sin_phi: float,
     cos_phi: float,
-) -> int:
+) -> None:
     """Contact of whisker i: updates PSI .. HELD_Y of its state and starts its vibration.
 
     (px, py, pz): pivot, m, world; (ux, uy): unit vector of the whisking plane, outward; phi: motor
     angle from straight down, rad, with sine and cosine. With ``skip`` only boxes the index names
-    are looked at. Returns the number of boxes in the whisking plane and within reach.
+    are looked at.
     """
     form, table = int(head[FORM, i]), int(head[TIP_TABLE, i])
     length, taper, rigidity = head[LENGTH, i], head[TAPER, i], head[RIGIDITY, i]
@@ -102,9 +107,8 @@ def touch(
     peg_box, side_box, side = int(state[PEG, i]), int(state[SIDE_BOX, i]), state[SIDE, i]
     lean, on_face = state[SIDE_LEAN, i], state[FACE, i] > 0.0
     old_peg, old_side_box = peg_box, side_box
-    sin_psi, cos_psi = sin(psi), cos(psi)
+    sin_psi, cos_psi, known = 0.0, 0.0, False  # of psi, once it is asked for
     floor = boxes.shape[0]
-    met = 0
 
     low, low_box, low_face, low_y, low_x = phi, -1, False, 0.0, 0.0
     high, high_box, high_face, high_y, high_x = phi, -1, False, 0.0, 0.0
@@ -119,8 +123,8 @@ def touch(
 
     if length * cos_phi > pz:
         moment, offset, _arc = tip(form, beam, table, 1.0 - taper * length, pz / length, phi)
-        angle = atan2(offset, pz / length)
-        if angle > phi:
+        if moment > 0.0:
+            angle = max(atan2(offset, pz / length), phi)
             low, low_box, low_face, low_y = angle, floor, True, moment / length
 
     for n in range(first, last):
@@ -131,13 +135,14 @@ def touch(
         near, far, near_x, far_x = slice_box(boxes, b, px, py, ux, uy)
         if near >= far or near >= length:
             continue
-        met += 1
         if b == side_box:
             continue
         own = b == peg_box
         if own:
             above = gamma > 0.0
         else:
+            if not known:
+                sin_psi, cos_psi, known = sin(psi), cos(psi), True
             where = wall_side(chord, drop, near, far, sin_psi, cos_psi)
             if where == 2:
                 continue
@@ -334,7 +339,6 @@ def touch(
     state[FACE, i] = 1.0 if on_face else 0.0
     state[SIDE_LEAN, i] = lean
     state[MOMENT_X, i], state[MOMENT_Y, i] = moment_x, moment_y
-    return met
 
 
 @compiled
@@ -349,15 +353,37 @@ def look_around(
     pose: NDArray[np.float64],
     px: float,
     py: float,
+    pz: float,
     ux: float,
     uy: float,
+    phi: float,
+    sin_phi: float,
+    cos_phi: float,
 ) -> None:
-    """Remember how far whisker i is from every box, whatever its angle."""
+    """Remember how far free whisker i is from what it could touch.
+
+    MARGIN: as it may turn, from boxes; ROOM: as it is, from boxes and floor. The part of it that is
+    well above a box is as far from that as it is above, the rest as far as seen from above.
+    """
     cell = index_cell(grid, px, py)
     length = head[LENGTH, i]
     margin = grid[GRID_REACH] - length
+    room = min(margin, pz - length * cos_phi)
     if cell >= 0:
         for n in range(starts[cell], starts[cell + 1]):
-            margin = min(margin, clearance(boxes, items[n], px, py, ux, uy, length))
-    memo[MARGIN, i] = margin - 1e-9
-    memo[FROM_X, i], memo[FROM_Y, i], memo[FROM_YAW, i] = pose[0], pose[1], pose[3]
+            b = items[n]
+            whole = clearance(boxes, b, px, py, ux, uy, length)
+            margin = min(margin, whole)
+            drop = max(pz - boxes[b, TOP], LEAST_DROP)
+            above = drop - length * cos_phi
+            if whole < room and above < room:
+                begin = 0.0
+                if cos_phi > 0.0:
+                    begin = min(max((drop - MOST_ROOM) / cos_phi, 0.0), length)
+                start = min(begin * sin_phi, length * sin_phi)
+                extent = (length - begin) * abs(sin_phi)
+                part = clearance(boxes, b, px + start * ux, py + start * uy, ux, uy, extent)
+                room = min(room, max(above, whole, min(part, MOST_ROOM)))
+    memo[MARGIN, i], memo[ROOM, i] = margin - SLACK, room - SLACK
+    memo[FROM_X, i], memo[FROM_Y, i], memo[FROM_Z, i] = pose[0], pose[1], pose[2]
+    memo[FROM_YAW, i], memo[FROM_PHI, i] = pose[3], phi

@@ -39,7 +39,7 @@ PIVOT = 0.04  # m, its pivot from the head axis
 @compiled
 def ring(state, memo, table, ticks):
     for _ in range(ticks):
-        vibrate(state, memo, table)
+        vibrate(state.reshape(-1), memo.reshape(-1), table.reshape(-1))
 
 
 def whisking(plant: HeadPlant, tick: float, share: float = 1.0) -> np.ndarray:
@@ -448,8 +448,7 @@ def test_undamped_free_whisker_keeps_its_energy() -> None:
             total[k] = square * plant.state[row] ** 2 + plant.state[row + 1] ** 2
         return total
 
-    for _ in range(50):
-        vibrate(plant.state, plant._memo, table)
+    ring(plant.state, plant._memo, table, 50)
     before = energy()
     ring(plant.state, plant._memo, table, 1_000_000)
     np.testing.assert_allclose(energy(), before, rtol=1e-9)
