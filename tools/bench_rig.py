@@ -45,7 +45,7 @@ PEGS, TIPS = range(2)
 
 
 def bench(out: Path, seconds: float, on_progress: OnProgress, *, quick: bool = False) -> Bench:
-    """Measure everything; seconds: of the long run; quick: so little that it only shows it works."""
+    """Measure everything; seconds: of the long run; quick: only enough to see that it works."""
     stretch = 2.0 if quick else 20.0
     parts: dict[str, Callable[[], list[Row]]] = {
         "beam": lambda: beam_rows(12 if quick else 400, SIZES[:3] if quick else SIZES),
@@ -251,7 +251,7 @@ def _skipping_row(name: str, boxes: Float64s, params: HeadPlantParams, over: Car
 
 
 def long_run_row(seconds: float) -> Row:
-    """Hours over walls everywhere, an hour and more into the ticks: what is not finite, how fast."""
+    """Hours over walls everywhere, many ticks after the first: what is not finite, how fast."""
     params = HeadPlantParams(sensor_drift=1e-6, friction=0.3)
     model = head_model(wall_boxes(random_maze(7, 5, 1, ring_walls=1.0, inner_walls=1.0)), params)
     piece = tour(20.0, 2000)

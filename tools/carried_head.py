@@ -1,4 +1,4 @@
-"""The simulated head carried along a given path, with given commands: for measuring the plant alone.
+"""The simulated head carried along a path, with given commands: for measuring the plant alone.
 
 Path and commands are given at knots a fixed time apart, whatever the rate of the plant's ticks, so
 that runs at different rates can be compared sample by sample. Between knots the head goes straight
@@ -102,9 +102,9 @@ def carry(
     return Felt(theta, x, y, held, n * per, seconds, state)
 
 
-def carried(boxes: Float64s, params: HeadPlantParams, carriage: Carriage, **options: int) -> Felt:
+def carried(boxes: Float64s, params: HeadPlantParams, carriage: Carriage) -> Felt:
     """`carry` over boxes float64[n, 5]."""
-    return carry(head_model(boxes, params), params, carriage, **options)
+    return carry(head_model(boxes, params), params, carriage)
 
 
 @compiled
