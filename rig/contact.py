@@ -18,7 +18,7 @@ from vibrissa.numerics import atan2, compiled, cos, sin
 from vibrissa.rig.beam import peg, tip
 from vibrissa.rig.scene import X_MAX, X_MIN, Y_MAX, Y_MIN
 
-NO_WALL = 9.0  # rad, beyond any angle
+NO_WALL = 9.0  # rad or m, beyond any
 LEAST_ARM = 0.02  # of the length: a contact nearer than this counts as being there
 
 FREE, ON_EDGE, ON_FACE, PAST = range(4)
@@ -204,8 +204,10 @@ def depths(
     From above: to the far upper edge, or to the top where that edge is out of reach; from inside:
     of the tip to the near face. Measured across edge or face, wherever the whisking plane cuts it.
     """
-    slope, _ = oblique(near_x, ux, uy)
-    inside = (chord * sin_psi - near) * slope
+    inside = NO_WALL
+    if near > 0.0:  # else the pivot is over the wall
+        slope, _ = oblique(near_x, ux, uy)
+        inside = (chord * sin_psi - near) * slope
     if far * far + drop * drop >= chord * chord:
         return chord * cos_psi - drop, inside
     slope, _ = oblique(far_x, ux, uy)

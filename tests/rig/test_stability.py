@@ -14,8 +14,9 @@ from vibrissa.control.kinematics import (
 )
 from vibrissa.rig import rows as h
 from vibrissa.rig.maze_random import random_maze
-from vibrissa.rig.plant import HeadPlant, HeadPlantParams, PlantError
+from vibrissa.rig.plant import HeadPlant, HeadPlantParams, PlantError, head_model
 from vibrissa.rig.scene import wall_boxes
+from vibrissa.tools.carried_head import carry, tour
 
 WALLS_EVERYWHERE = wall_boxes(random_maze(6, 5, 1, ring_walls=1.0, inner_walls=1.0))
 MOST = 0.2  # N m: far above what any whisker can bear, far below a runaway
@@ -113,6 +114,21 @@ def test_long_rest_leaves_nothing_that_grows_and_no_subnormal_number() -> None:
     for t in range(14000, 14100):
         plant.step(t, (0.5, 0.41, NOSE_HEIGHT, 0.0), hold)
     assert plant.state.tobytes() == still.tobytes()
+
+
+def test_a_day_of_ticks_later_and_for_minutes_everything_stays_bounded() -> None:
+    # Five minutes of a day: the first, and those a day and 2^33 ticks later; `vibrissa bench rig
+    # --duration 86400` runs the whole day.
+    params = HeadPlantParams(sensor_drift=1e-6, friction=0.3)
+    model, minutes = head_model(WALLS_EVERYWHERE, params), tour(60.0, 2000)
+    spread = []
+    for first in (0, 120_000, 172_800_000, 2**33, 2**62):
+        felt = carry(model, params, minutes, first_tick=first)
+        for values in (felt.theta, felt.x, felt.y, felt.state):
+            assert np.isfinite(values).all()
+        assert felt.held > 10_000 and np.abs(felt.y).max() < MOST
+        spread.append(felt.y.std())
+    assert max(spread) < 1.05 * min(spread)
 
 
 def with_lengths(length: float) -> HeadGeometry:
