@@ -335,6 +335,8 @@ def _whisk(
     pose = np.empty(4, dtype=np.float64)
     held = np.empty(WHISKERS, dtype=np.float64)
     given = np.empty(WHISKERS, dtype=np.float32)
+    theta = np.empty(WHISKERS, dtype=np.float32)
+    x, y, command = np.empty_like(theta), np.empty_like(theta), np.empty_like(theta)
     for j in range(ticks):
         tick = first + j
         k = tick // ARM_PERIOD - first // ARM_PERIOD
@@ -343,8 +345,6 @@ def _whisk(
             pose[a] = poses[k, a] + (poses[k + 1, a] - poses[k, a]) * part
         for i in range(WHISKERS):
             held[i] = state[at(GAMMA, i)]
-        theta, x, y = signals[SAMPLED_THETA, j], signals[SAMPLED_X, j], signals[SAMPLED_Y, j]
-        applied = signals[APPLIED, j]
         status = head_step(state, memo, model, True, seed, tick, pose, last, tick == 0, theta, x, y)
         if status != OK:
             return status
@@ -352,9 +352,7 @@ def _whisk(
             gamma = state[at(GAMMA, i)]
             deepest[i] = max(deepest[i], abs(gamma))
             slips[i] += 1 if held[i] - gamma > SLIP else 0
-            applied[i] = last[i]
 
-        command = signals[COMMANDED, j]
         if law == OPEN_LOOP:
             open_loop_command(tick, theta, x, y, parameters, law_state, command)
         elif law == RCP:
@@ -362,6 +360,12 @@ def _whisk(
         else:
             social_command(tick, theta, x, y, parameters, law_state, command)
 
+        for i in range(WHISKERS):
+            signals[SAMPLED_THETA, j, i] = theta[i]
+            signals[SAMPLED_X, j, i] = x[i]
+            signals[SAMPLED_Y, j, i] = y[i]
+            signals[APPLIED, j, i] = last[i]
+            signals[COMMANDED, j, i] = command[i]
         _route(
             command, tick < retract_tick, travel, slew, last, active, retract_parameters,
             retract_state, given,

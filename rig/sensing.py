@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.control.kinematics import WHISKERS
-from vibrissa.numerics import compiled, cos, log, philox4x32, philox_normals4, sin
+from vibrissa.numerics import compiled, cos_sin_turn, log, philox4x32, philox_normals4
 from vibrissa.rig.rows import DRIFT_STEP, DRIFT_X, DRIFT_Y, at
 
 BLOCKS = 16  # of four 32-bit words, each pair of words gives two normals
@@ -39,9 +39,9 @@ def normals(seed: int, tick: int, uniforms: NDArray[np.float64], out: NDArray[np
         u = ((uniforms[n] - 2.0**52) + 0.5) * 2.0**-32
         uniforms[n] = math.sqrt(-2.0 * log(u))
     for n in range(PAIRS):
-        angle = ((uniforms[PAIRS + n] - 2.0**52) + 0.5) * (2.0**-31 * math.pi)
-        out[n] = uniforms[n] * cos(angle)
-        out[PAIRS + n] = uniforms[n] * sin(angle)
+        c, s = cos_sin_turn(((uniforms[PAIRS + n] - 2.0**52) + 0.5) * 2.0**-32)
+        out[n] = uniforms[n] * c
+        out[PAIRS + n] = uniforms[n] * s
 
 
 @compiled
