@@ -24,9 +24,10 @@ from vibrissa.rig.beam_table import (
     MOST_HEIGHT,
     interpolate_peg,
     interpolate_tip,
-    most_gamma,
+    most_turned,
     peg_table,
     tip_table,
+    turned_by,
 )
 
 FORMS = ("linear", "table", "exact")
@@ -41,25 +42,28 @@ def beam_tables(ratios: tuple[float, ...], size: int) -> NDArray[np.float64]:
 
 @compiled
 def peg(
-    form: int, tables: NDArray[np.float64], q: float, gamma: float
+    form: int, tables: NDArray[np.float64], q: float, half: float
 ) -> tuple[float, float, float, bool]:
     """The shaft against a peg: (moment, arc length, angle at the contact, whether it rests there).
 
-    gamma: rad, >= 0. Moment in E I0 / d, arc length to the contact in d, angle in rad, from the
-    base's direction. Where it can't rest, the shaft slides past the peg.
+    half: tan(gamma / 2), >= 0. Moment in E I0 / d, arc length to the contact in d, angle in rad,
+    from the base's direction. Where it can't rest, the shaft slides past the peg.
     """
     if form == EXACT:
+        gamma = 2.0 * atan2(half, 1.0)
         _force, arc, moment, angle, rests = elastica.peg_contact(q, gamma, EXACT_STEPS)
         return moment, arc, angle, rests
-    row = (q - LEAST_Q) / (1.0 - LEAST_Q)
+    row = (q - LEAST_Q) * (1.0 / (1.0 - LEAST_Q))
     if form == LINEAR:
+        gamma = 2.0 * atan2(half, 1.0)
         _one, bow, slope = interpolate_peg(tables[0], row, 0.0)
         return 3.0 * q * gamma, 1.0 + bow * gamma * gamma, slope * gamma, True
-    share = gamma / most_gamma(tables[0], row)
+    turned = turned_by(half)
+    share = turned / most_turned(tables[0], row)
     if share > 1.0:
         return 0.0, 1.0, 0.0, False
     part, bow, slope = interpolate_peg(tables[0], row, 1.0 - math.sqrt(1.0 - share * share))
-    return 3.0 * q * gamma * part, 1.0 + bow * gamma * gamma, slope * gamma, True
+    return 3.0 * q * turned * part, 1.0 + bow * turned * turned, slope * turned, True
 
 
 @compiled

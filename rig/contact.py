@@ -171,7 +171,7 @@ def oblique(along_x: bool, ux: float, uy: float) -> tuple[float, float]:
 def across_edge(
     distance: float, drop: float, sin_phi: float, cos_phi: float, slope: float
 ) -> tuple[float, float, float]:
-    """A straight edge as a peg: (its distance from the pivot, gamma, foreshortening w).
+    """A straight edge as a peg: (its distance from the pivot, tan(gamma / 2), foreshortening w).
 
     The edge is level, ``distance`` m from the pivot along its horizontal normal and ``drop`` below;
     slope: cosine of the angle between that normal and the whisking plane. Without friction it bends
@@ -181,9 +181,9 @@ def across_edge(
     x, z = sin_phi * slope, cos_phi
     square = max(x * x + z * z, 1e-18)
     w = math.sqrt(square)
-    along, off = distance * x + drop * z, distance * z - drop * x
-    reach = math.sqrt(along * along + off * off * square) / square
-    return reach, atan2(off * w, along), w
+    along, off = distance * x + drop * z, (distance * z - drop * x) * w
+    hypotenuse = math.sqrt(along * along + off * off)
+    return hypotenuse / square, off / max(hypotenuse + along, 1e-18), w
 
 
 @compiled
@@ -249,9 +249,9 @@ def from_above(
             return FREE, phi, 0.0, 0.0
         edge = True
         slope, left = oblique(far_x, ux, uy)
-        reach, gamma, w = across_edge(far * slope, drop, sin_phi, cos_phi, slope)
+        reach, half, w = across_edge(far * slope, drop, sin_phi, cos_phi, slope)
         arm = min(max(reach, LEAST_ARM * length), length)
-        moment, arc, angle, rests = peg(form, tables, 1.0 - taper * arm, max(gamma, 0.0))
+        moment, arc, angle, rests = peg(form, tables, 1.0 - taper * arm, max(half, 0.0))
         edge_angle = atan2(far, drop)
         push = moment / (arm * w)
         edge_y, edge_x = push * slope, push * left * cos_phi
@@ -326,10 +326,10 @@ def from_inside(
             through_edge = max(s * toward + bent_x * bow - distance, 0.0)
     edge_holds, edge_y, edge_x, edge_angle, through_face = False, 0.0, 0.0, phi, 0.0
     if (through_edge > 0.0 or not tip_holds) and near * near + drop * drop < length * length:
-        reach, gamma, w = across_edge(distance, drop, sin_phi, cos_phi, slope)
-        if gamma < 0.0 and reach < length:
+        reach, half, w = across_edge(distance, drop, sin_phi, cos_phi, slope)
+        if half < 0.0 and reach < length:
             arm = max(reach, LEAST_ARM * length)
-            moment, arc, angle, rests = peg(form, tables, 1.0 - taper * arm, -gamma)
+            moment, arc, angle, rests = peg(form, tables, 1.0 - taper * arm, -half)
             if rests and arc * arm <= length:
                 edge_holds, edge_angle = True, atan2(near, drop)
                 push = moment / (arm * w)

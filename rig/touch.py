@@ -255,7 +255,8 @@ def touch(
             if 0.0 < lean < MOST_LEAN:
                 arm = min(max(u / s, LEAST_ARM * length), length)
                 turn = lean * s
-                moment, arc, _angle, held = peg(form, beam, 1.0 - taper * arm, turn)
+                half = sin(turn) / (1.0 + cos(turn))
+                moment, arc, _angle, held = peg(form, beam, 1.0 - taper * arm, half)
                 held = held and arc * arm <= length
                 if held:
                     turn_square = turn * turn

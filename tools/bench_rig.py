@@ -100,6 +100,7 @@ def beam_rows(points: int, sizes: tuple[int, ...]) -> list[Row]:
     places[:, 0] = rng.uniform(LEAST_Q, 1.0, points)
     for k, q in enumerate(places[:, 0]):
         places[k, 1] = elastica.last_peg(q, 100)[2] * rng.uniform(0.0, 0.999)
+    places[:, 2] = np.tan(0.5 * places[:, 1])
     tips = rng.uniform((LEAST_HEIGHT, 0.0), (0.999, 1.0), (points, 2))
     turns = np.array([math.acos(h) * (1.0 - share) for h, share in tips])
     planes = np.stack([tips[:, 0], turns, np.zeros(points)], axis=1)
@@ -155,7 +156,7 @@ def _evaluate(
     for _ in range(repeats):
         for k in range(at.shape[0]):
             if kind == PEGS:
-                moments[k] = peg(form, tables, at[k, 0], at[k, 1])[0]
+                moments[k] = peg(form, tables, at[k, 0], at[k, 2])[0]
             else:
                 moments[k] = tip(form, tables, 1, RATIO, at[k, 0], at[k, 1])[0]
 

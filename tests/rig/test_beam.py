@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc
 
 from vibrissa.rig.beam import EXACT, LEAST_HEIGHT, LINEAR, TABLE, beam_tables, peg, tip
-from vibrissa.rig.beam_table import most_gamma, peg_table, tip_table
+from vibrissa.rig.beam_table import SIZE, most_turned, peg_table, tip_table, turned_by
 from vibrissa.rig.elastica import STEPS, dead_load, last_peg, peg_contact, shoot, tip_contact
 from vibrissa.rig.whisker import slip_coefficient
 
 RATIO = 0.25  # tip over base diameter
-TABLES = beam_tables((RATIO, 1.0), 49)
+TABLES = beam_tables((RATIO, 1.0), SIZE)
 
 # Dead transverse load on the tip of a cylinder: P L^2 / (E I), deflection and shortening over the
 # length, tip angle (rad). After Bisshopp and Drucker, and Mattiasson.
@@ -113,7 +113,13 @@ def test_beyond_the_largest_angle_nothing_holds_the_shaft() -> None:
         most = last_peg(q, STEPS)[2]
         assert peg_contact(q, 0.9999 * most, STEPS)[4]
         assert not peg_contact(q, 1.0001 * most, STEPS)[4]
-        assert most_gamma(peg_table(49), (q - 0.1) / 0.9) == pytest.approx(most, rel=1e-4)
+        found = most_turned(peg_table(SIZE), (q - 0.1) / 0.9)
+        assert found == pytest.approx(turned_by(math.tan(most / 2)), rel=1e-4)
+
+
+def test_angle_by_a_division_is_nearly_the_angle() -> None:
+    for gamma in np.linspace(0.01, 1.75, 50):
+        assert turned_by(math.tan(gamma / 2)) == pytest.approx(gamma, rel=3e-2)
 
 
 def test_tip_on_a_plane_lies_down_and_its_contact_moves_up_the_shaft() -> None:
@@ -124,7 +130,7 @@ def test_tip_on_a_plane_lies_down_and_its_contact_moves_up_the_shaft() -> None:
 @given(st.floats(0.1, 1.0), st.floats(1e-6, 1e-3))
 def test_forms_agree_at_small_angles(q: float, gamma: float) -> None:
     for form in (LINEAR, TABLE, EXACT):
-        moment, arc, _, rests = peg(form, TABLES, q, gamma)
+        moment, arc, _, rests = peg(form, TABLES, q, math.tan(gamma / 2))
         assert rests
         assert moment == pytest.approx(3 * q * gamma, rel=2e-3)
         assert arc - 1 == pytest.approx(slip_coefficient(q) * gamma**2, rel=2e-2, abs=1e-12)
@@ -133,8 +139,8 @@ def test_forms_agree_at_small_angles(q: float, gamma: float) -> None:
 @given(st.floats(0.1, 1.0), st.floats(0.0, 0.9999))
 @settings(max_examples=200, deadline=None)
 def test_interpolated_peg_is_within_a_thousandth_everywhere(q: float, share: float) -> None:
-    gamma = share * most_gamma(TABLES[0], (q - 0.1) / 0.9)
-    fast, exact = peg(TABLE, TABLES, q, gamma), peg(EXACT, TABLES, q, gamma)
+    half = math.tan(share * last_peg(q, 64)[2] / 2)
+    fast, exact = peg(TABLE, TABLES, q, half), peg(EXACT, TABLES, q, half)
     if exact[3]:
         assert fast[0] == pytest.approx(exact[0], rel=1e-3, abs=1e-9)
         assert fast[1] == pytest.approx(exact[1], rel=1e-4)
@@ -174,7 +180,7 @@ def test_larger_tables_are_nearer_to_the_exact_form() -> None:
     for size in (9, 17, 33):
         tables = beam_tables((RATIO,), size)
         found = [
-            (peg(TABLE, tables, q, g * q)[0], peg(EXACT, tables, q, g * q)[0])
+            (peg(TABLE, tables, q, g * q / 2)[0], peg(EXACT, tables, q, g * q / 2)[0])
             for q in np.linspace(0.3, 1.0, 8)
             for g in (0.2, 0.5, 0.8)
         ]

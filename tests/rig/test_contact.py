@@ -137,10 +137,10 @@ def test_oblique_wall_pushes_to_the_side_and_mirrored_walls_to_the_other() -> No
 
 
 def test_edge_across_the_plane_is_where_it_is_seen() -> None:
-    distance, gamma, w = across_edge(0.075, DROP, math.sin(0.7), math.cos(0.7), 1.0)
+    distance, half, w = across_edge(0.075, DROP, math.sin(0.7), math.cos(0.7), 1.0)
     assert w == pytest.approx(1.0)
     assert distance == pytest.approx(math.hypot(0.075, DROP))
-    assert gamma == pytest.approx(math.atan2(0.075, DROP) - 0.7)
+    assert 2 * math.atan(half) == pytest.approx(math.atan2(0.075, DROP) - 0.7)
 
 
 @given(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-math.pi, math.pi))

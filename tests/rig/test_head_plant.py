@@ -151,7 +151,7 @@ def test_contact_moment_is_the_elastica_s(params: HeadPlantParams) -> None:
     beam = plant.model.beam
     moment = []
     for phi in touch - gamma[::20]:
-        unit, _, angle, _ = peg(EXACT, beam, q, max(touch - phi, 0.0))
+        unit, _, angle, _ = peg(EXACT, beam, q, math.tan(max(touch - phi, 0.0) / 2))
         moment.append(unit / d)
         if phi + angle > math.pi / 2:  # the shaft has come to lie along the wall's top
             end, length = (
