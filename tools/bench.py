@@ -85,8 +85,10 @@ BENCHES: Final[dict[str, str]] = {
     "replay": "vibrissa.tools.bench_replay:bench",
     "faults": "vibrissa.tools.bench_faults:bench",
     "swap": "vibrissa.tools.bench_swap:bench",
+    "rig": "vibrissa.tools.bench_rig:bench",
     "slam": "vibrissa.tools.bench_slam:bench",
     "slam-stress": "vibrissa.tools.bench_slam_stress:bench",
+    "experiment": "vibrissa.tools.bench_experiment:bench",
 }
 """name -> where its function is, imported when it is asked for."""
 
@@ -110,7 +112,7 @@ def bench(
         typer.Option(help="Directory for bench-NAME.json, its picture and its logs; kept."),
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Small sizes, to see that a bench works (slam only).")
+        bool, typer.Option("--quick", help="Small sizes, to see that a bench works (slam, rig).")
     ] = False,
     swaps: Annotated[
         int | None, typer.Option(min=1, help="How many swaps to make (swap only).")

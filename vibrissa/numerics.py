@@ -5,7 +5,18 @@ each other.
 """
 
 from vibrissa.compilation import compiled
-from vibrissa.elementary import MAX_ANGLE, acos, asin, atan2, cos, exp, hypot, log, sin
+from vibrissa.elementary import (
+    MAX_ANGLE,
+    acos,
+    asin,
+    atan2,
+    cos,
+    cos_sin_turn,
+    exp,
+    hypot,
+    log,
+    sin,
+)
 from vibrissa.philox import (
     normal_quantile,
     philox4x32,
@@ -21,6 +32,7 @@ __all__ = [
     "atan2",
     "compiled",
     "cos",
+    "cos_sin_turn",
     "exp",
     "hypot",
     "log",
