@@ -93,7 +93,7 @@ def _maker(name: str, experiment: Experiment) -> Maker:
     for point in points:
         return _imported(name, point.value)
     raise RunError(
-        f"controller {name!r}: unknown, expected one of {', '.join(available(experiment))}"
+        f"controller {name} is not installed; installed are {', '.join(available(experiment))}"
     )
 
 

@@ -186,6 +186,8 @@ class Requests:
 
     def _load(self, name: str, parameters: str = "") -> Program:
         slot = yield from self._loaded(name, parameters)
+        if slot not in self.slots:
+            raise RunError(f"{name} failed as soon as it was loaded")
         return f"{self.slots[slot]} ({slot}) answers in shadow"
 
     def _swap(
