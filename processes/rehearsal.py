@@ -13,12 +13,12 @@ import numpy as np
 
 from vibrissa.control.kinematics import NOSE_HEIGHT
 from vibrissa.messages import types
-from vibrissa.messages.codec import CODECS
+from vibrissa.messages.codec import CODECS, Message
 from vibrissa.messages.types import TICK_NS, WHISKERS
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.node import Node, Stepper
 from vibrissa.processes.results import RunError
-from vibrissa.processes.table import ROWS, SLOTS, build
+from vibrissa.processes.table import ROWS, SLAM_SLOTS, SLOTS, build
 
 TICKS = 1600
 PERIOD = 400
@@ -41,7 +41,11 @@ def rehearse(name: str, experiment: Experiment, controller: str | None = None) -
             "whisk": experiment.whisk.model_copy(update=changes),
         }
     )
-    rehearse_node(name, build(name, short))
+    node = build(name, short)
+    if name in SLAM_SLOTS:
+        order = types.Order(0, "assign", name, controller or experiment.slam.algorithm, "", -1, 0)
+        node.step(Message("run.order", "supervisor", 0, 0, 0, order))
+    rehearse_node(name, node)
 
 
 def rehearse_node(name: str, node: Node) -> None:

@@ -21,9 +21,8 @@ from vibrissa.messages.log_format import LogError, Record
 from vibrissa.messages.log_reader import LogReader
 from vibrissa.messages.topics import TOPICS
 from vibrissa.messages.types import TICK_NS, Event, Order
-from vibrissa.processes import provenance
+from vibrissa.processes import controllers, provenance, slams
 from vibrissa.processes.config import Experiment
-from vibrissa.processes.controllers import available
 from vibrissa.processes.framelog import frame_of
 from vibrissa.processes.lockstep import LocalRunner, RemoteRunner, Workers
 from vibrissa.processes.node_check import NodeCheck, first_cause
@@ -42,7 +41,7 @@ from vibrissa.processes.results import (
     Verdict,
     silent,
 )
-from vibrissa.processes.table import PROCESSES, ROWS, SLOTS
+from vibrissa.processes.table import ALL_SLOTS, PROCESSES, ROWS, SLAM_SLOTS
 
 PUMP_RECORDS: Final = 4000
 AFTERMATH_NS: Final = 500_000_000
@@ -164,7 +163,7 @@ class Checks:
     ) -> None:
         self._start = start
         self._path = path
-        self._installed = available(experiment)
+        self._installed = controllers.available(experiment) | slams.available(experiment)
         self._lost: dict[str, int] = {}
         self.recalled: list[str] = []
         """What was computed that is not in the log, one line per process that was killed."""
@@ -250,10 +249,10 @@ class Checks:
         order: Order = decode(frame).body
         if order.kind == "open" and order.name not in self._installed:
             raise UnusableLogError(
-                f"{self._path}: controller {order.name} is not installed and the run loaded it "
-                f"into {order.node}; installed are {', '.join(self._installed)}"
+                f"{self._path}: {_word(order.node)} {order.name} is not installed and the run "
+                f"loaded it into {order.node}; installed are {', '.join(self._installed)}"
             )
-        if order.kind == "open" and order.node in SLOTS and order.node not in self._by_name:
+        if order.kind == "open" and order.node in ALL_SLOTS and order.node not in self._by_name:
             self._add([order.node])
 
     def _add(self, names: Sequence[str]) -> None:
@@ -262,3 +261,7 @@ class Checks:
             for topic in ROWS[runner.name].hears:
                 if topic in self._hearers:
                     self._hearers[topic].append(check)
+
+
+def _word(slot: str) -> str:
+    return "slam" if slot in SLAM_SLOTS else "controller"

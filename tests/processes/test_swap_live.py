@@ -31,7 +31,7 @@ PATIENCE_TICKS = 20
 
 
 @pytest.fixture(autouse=True)
-def run_folders(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def run_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Short paths for sockets, and no process left."""
     folder = Path(tempfile.mkdtemp(prefix="runs-"))
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
