@@ -219,7 +219,7 @@ class Requests:
         """Swap what moves nothing by itself: the node concerned does it between two cycles."""
         if node == "arm" and parameters:
             raise RunError("swap: circuits of the arm have no parameters")
-        target, what = name, name
+        target, what = name, "circuits"
         if node == "slam":
             target = yield from self._loaded(self._slams, name, parameters)
             what = f"{self._slams.slots.get(target, target)} ({target})"
