@@ -8,16 +8,24 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
+from vibrissa.control.calibration import Calibration
 from vibrissa.control.kinematics import Float32s
 from vibrissa.control.open_loop import OpenLoop
 from vibrissa.control.whisk_pattern import WhiskParams
+from vibrissa.messages.codec import CODECS, Message
+from vibrissa.messages.types import TICK_NS, WhiskCommand
+from vibrissa.processes.host import Host
+from vibrissa.processes.whisk import WhiskNode
 
-SHADOW_TICKS = 1000
+SHADOW_TICKS = 2000
+"""More than a rehearsal has."""
 ACTIVE_TICKS = 100
 
 
@@ -100,14 +108,6 @@ class SaysWords(Faulty):
         return "fast"
 
 
-class Late(Faulty):
-    """10 ms late from some moment on."""
-
-    def fault(self, command: Float32s) -> Any:
-        time.sleep(0.01)
-        return command
-
-
 class Killed(Faulty):
     """Its process is gone at once, without a word."""
 
@@ -115,12 +115,90 @@ class Killed(Faulty):
         os.kill(os.getpid(), signal.SIGKILL)
 
 
-class Stopped(Faulty):
-    """Its process stands still."""
+def caller(kind: type) -> Any:
+    """The nearest object of a class whose method is running; None when there is none.
+
+    What a controller must not do: reach for the process around it. A re-run has no live host.
+    """
+    frame = sys._getframe()
+    while frame is not None:
+        if isinstance(found := frame.f_locals.get("self"), kind):
+            return found
+        frame = frame.f_back
+    return None
+
+
+class Ailing(OpenLoop):
+    """A first controller that, once calibrated, is late, then stale, then stands still for good.
+
+    In between it is well for long enough to get the drives back, on a machine that is not too busy.
+    """
+
+    LATE, STALE, STILL = 400, 2000, 3600
+    """Ticks after the calibration at which it happens."""
+    TICKS = 60
+    """How long the first two last."""
+
+    def __init__(self, whisk: WhiskParams) -> None:
+        super().__init__(whisk)
+        self._calibrated: int | None = None
+        self._now = 0
+
+    def calibrate(self, calibration: Calibration) -> None:
+        super().calibrate(calibration)
+        self._calibrated = self._now
+
+    def step(self, tick: int, theta: Float32s, x: Float32s, y: Float32s) -> Float32s:
+        self._now = tick
+        command = super().step(tick, theta, x, y)
+        if self._calibrated is None:
+            return command
+        since = tick - self._calibrated
+        if self.LATE <= since < self.LATE + self.TICKS:
+            time.sleep(0.01)
+        if since == self.STALE:
+            self._say_stale(caller(WhiskNode), tick)
+        if since == self.STILL:
+            os.kill(os.getpid(), signal.SIGSTOP)
+        return command
+
+    def _say_stale(self, node: Any, start: int) -> None:
+        """Have answers bear the tick of five samples ago for a while."""
+        fresh = node.step
+
+        def step(message: Message) -> Iterator[tuple[str, Any]]:
+            for topic, body in fresh(message):
+                stale = topic == "whisk.command" and start <= body.tick < start + self.TICKS
+                yield topic, WhiskCommand(body.tick - 5, body.command) if stale else body
+
+        node.step = step
+
+
+class Forger(Faulty):
+    """Sends commands in the name of the run's first controller beside its own."""
+
+    copies, source = 1, "whisk"
+
+    def step(self, tick: int, theta: Float32s, x: Float32s, y: Float32s) -> Float32s:
+        self._tick = tick
+        return super().step(tick, theta, x, y)
 
     def fault(self, command: Float32s) -> Any:
-        os.kill(os.getpid(), signal.SIGSTOP)
+        host = caller(Host)
+        if host is not None:
+            source = self.source or host.name
+            body = WhiskCommand(self._tick, np.zeros(18, np.float32))
+            forged = CODECS["whisk.command"].encode(source, 0, 10**6, self._tick * TICK_NS, body)
+            for _ in range(self.copies):
+                host.port.publish(forged)
         return command
+
+
+class Floods(Forger):
+    """Fills everybody's sockets while it is in shadow."""
+
+    when, after = 1, SHADOW_TICKS
+    copies, source = 2000, ""
 
 
 class KilledInShadow(Killed):
