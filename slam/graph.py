@@ -35,8 +35,7 @@ ANCHOR: Final = 1e12
 @dataclass(frozen=True, slots=True)
 class GraphParams:
     """lateral (m): standard deviation of sideways motion in a step; loop_place (m), loop_heading
-    (rad): of a loop; robust: chi^2 (3 degrees of freedom) at which a loop loses half its pull in the
-    end; loosest: how many times that at first; iterations of Gauss-Newton."""
+    (rad): of a loop; robust: chi^2 (3 degrees of freedom) at which a loop's pull is a quarter in the end; loosest: how many times that at first; iterations of Gauss-Newton."""
 
     lateral: float = 0.0015
     loop_place: float = 0.015
@@ -44,6 +43,10 @@ class GraphParams:
     robust: float = 9.0
     loosest: float = 1e4
     iterations: int = 12
+
+    def scale(self, iteration: int) -> float:
+        """Scale (chi^2) of the robust function: falls tenfold each time, then stays at `robust`."""
+        return self.robust * max(self.loosest * 0.1**iteration, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,9 +81,8 @@ def optimise(graph: Graph, start: Floats, params: GraphParams) -> Solution:
     nodes = len(poses)
     pairs, slots = block_pairs(nodes, graph.loops)
     structure = analyse(nodes, pairs)
-    ratio = params.loosest ** (1.0 / max(params.iterations - 3, 1))
     for iteration in range(params.iterations):
-        scale = params.robust * max(params.loosest / ratio**iteration, 1.0)
+        scale = params.scale(iteration)
         weigh(graph.loops, graph.turns, poses, params, scale, weights)
         step = _newton(graph, structure, slots, poses, params, weights)
         poses += step
@@ -169,6 +171,34 @@ def _weigh(
 
 
 @compiled
+def step_residual(
+    step: Floats,
+    a: Floats,
+    b: Floats,
+    lateral: float,
+    r: Floats,
+    w: Floats,
+    j_a: Floats,
+    j_b: Floats,
+) -> None:
+    """Residual r (m, m, rad), precision w and derivatives j_a, j_b by the two poses of a step."""
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    c, s = cos(b[2]), sin(b[2])
+    r[0] = c * dx + s * dy - step[0]
+    r[1] = c * dy - s * dx
+    r[2] = b[2] - a[2] - step[1]
+    w[0] = 1.0 / (step[2] * step[2])
+    w[1] = 1.0 / (lateral * lateral)
+    w[2] = 1.0 / (step[3] * step[3])
+    j_b[0, 0], j_b[0, 1], j_b[0, 2] = c, s, c * dy - s * dx
+    j_b[1, 0], j_b[1, 1], j_b[1, 2] = -s, c, -c * dx - s * dy
+    j_b[2, 0], j_b[2, 1], j_b[2, 2] = 0.0, 0.0, 1.0
+    j_a[0, 0], j_a[0, 1], j_a[0, 2] = -c, -s, 0.0
+    j_a[1, 0], j_a[1, 1], j_a[1, 2] = s, -c, 0.0
+    j_a[2, 0], j_a[2, 1], j_a[2, 2] = 0.0, 0.0, -1.0
+
+
+@compiled
 def _assemble(
     steps: Floats,
     loops: Ints,
@@ -189,24 +219,13 @@ def _assemble(
     nodes = poses.shape[0]
     j_a = np.zeros((3, 3))
     j_b = np.zeros((3, 3))
-    j_a[2, 2], j_b[2, 2] = -1.0, 1.0
     block = np.zeros((3, 3))
     r = np.empty(3)
     w = np.empty(3)
     for p in range(3):
         diagonal[place[0], p, p] += ANCHOR
     for i in range(nodes - 1):
-        distance, turn, along, around = steps[i]
-        dx = poses[i + 1, 0] - poses[i, 0]
-        dy = poses[i + 1, 1] - poses[i, 1]
-        c, s = cos(poses[i + 1, 2]), sin(poses[i + 1, 2])
-        r[0] = c * dx + s * dy - distance
-        r[1] = c * dy - s * dx
-        r[2] = poses[i + 1, 2] - poses[i, 2] - turn
-        w[0], w[1], w[2] = 1.0 / (along * along), 1.0 / (lateral * lateral), 1.0 / (around * around)
-        j_b[0, 0], j_b[0, 1], j_b[0, 2] = c, s, c * dy - s * dx
-        j_b[1, 0], j_b[1, 1], j_b[1, 2] = -s, c, -c * dx - s * dy
-        j_a[:2, :2] = -j_b[:2, :2]
+        step_residual(steps[i], poses[i], poses[i + 1], lateral, r, w, j_a, j_b)
         here, there = place[i], place[i + 1]
         for p in range(3):
             for q in range(3):

@@ -133,7 +133,7 @@ def factorise(start: Ints, row: Small, diagonal: Floats, lower: Floats) -> bool:
     nodes = diagonal.shape[0]
     raw = np.empty((3, 3))
     for c in range(nodes):
-        if not _invert(diagonal[c]):
+        if not invert(diagonal[c]):
             return False
         inverse = diagonal[c]
         for p in range(start[c], start[c + 1]):
@@ -169,7 +169,7 @@ def _subtract(target: Floats, a: Floats, b: Floats) -> None:
 
 
 @compiled
-def _invert(block: Floats) -> bool:
+def invert(block: Floats) -> bool:
     """A symmetric positive definite 3 x 3 block by its inverse, in place."""
     a, b, c = block[0, 0], block[1, 0], block[2, 0]
     d, e, f = block[1, 1], block[2, 1], block[2, 2]
