@@ -1,4 +1,4 @@
-"""A pose graph with one node per whisk: odometry between successive nodes, loops between mid-whisks.
+"""A pose graph with a node per whisk: odometry between successive nodes, loops between mid-whisks.
 
 Minimises over poses (x m, y m, heading rad, not wrapped)
 - for every odometry step i -> i + 1 with distance d and turn w
@@ -34,8 +34,12 @@ ANCHOR: Final = 1e12
 
 @dataclass(frozen=True, slots=True)
 class GraphParams:
-    """lateral (m): standard deviation of sideways motion in a step; loop_place (m), loop_heading
-    (rad): of a loop; robust: chi^2 (3 degrees of freedom) at which a loop's pull is a quarter in the end; loosest: how many times that at first; iterations of Gauss-Newton."""
+    """Weights of the graph.
+
+    lateral (m): standard deviation of sideways motion in a step; loop_place (m), loop_heading
+    (rad): of a loop; robust: chi^2 (3 degrees of freedom) at which a loop's pull is a quarter in
+    the end; loosest: how many times that at first; iterations: of Gauss-Newton.
+    """
 
     lateral: float = 0.0015
     loop_place: float = 0.015
@@ -51,9 +55,12 @@ class GraphParams:
 
 @dataclass(frozen=True, slots=True)
 class Graph:
-    """steps float64[n - 1, 4]: distance (m), turn (rad), and their standard deviations, of the step
-    that ends at node 1, 2, ..; loops int64[m, 2]: nodes (a, b), a - 1 > b > 0; turns float64[m]: heading
-    of a over b, rad, with as many whole turns as the start values have."""
+    """What the poses have to agree with.
+
+    steps float64[n - 1, 4]: distance (m), turn (rad), and their standard deviations, of the step
+    that ends at node 1, 2, ..; loops int64[m, 2]: nodes (a, b), a - 1 > b > 0; turns float64[m]:
+    heading of a over b, rad, with as many whole turns as the start values have.
+    """
 
     steps: Floats
     loops: Ints

@@ -1,7 +1,7 @@
-"""Where the pose graph's optimisation starts: headings filtered over odometry and loops as they come.
+"""Where the pose graph starts from: headings filtered over odometry and loops as they come.
 
-Plain odometry is not good enough: after ten laps its heading is off by more than pi, each loop would
-pick its own multiple of 2 pi, and the optimum would be wound up.
+Plain odometry is not good enough: after ten laps its heading is off by more than pi, each loop
+would pick its own multiple of 2 pi, and the optimum would be wound up.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ def start_values(
     """Fill poses float64[n, 3] after node `first` (headings not wrapped) and turns float64[m].
 
     poses up to `first` are given. steps float64[n - 1, 4]: distance, turn and their standard
-    deviations, of the step that ends at node 1, 2, ..; loops int64[m, 2] in ascending order of their
-    later node (column 0), all after `first`; facing int8[m]: 1 when the two face opposite ways.
-    turns: the heading of one over the other, with its whole turns. A scalar Kalman filter of the
-    heading in the map of its own past, which counts as known. Without loops the poses are dead
+    deviations, of the step that ends at node 1, 2, ..; loops int64[m, 2] in ascending order of
+    their later node (column 0), all after `first`; facing int8[m]: 1 when the two face opposite
+    ways. turns: the heading of one over the other, with its whole turns. A scalar Kalman filter of
+    the heading in the map of its own past, which counts as known. Without loops the poses are dead
     reckoning.
     """
     uncertain = 0.0

@@ -1,4 +1,4 @@
-"""How far an odometer can be trusted: its scatter, measured on a straight and on a turn in place."""
+"""How far an odometer can be trusted: its scatter on a straight and on a turn in place."""
 
 from __future__ import annotations
 

@@ -2,8 +2,8 @@
 
 One image says little about where the head is: corridors look alike. A sequence of them does. What
 every whisk felt, as 18 bits, is compared with all remembered whisks in both directions of travel
-(`sequence_chain`); where a place is certain (`sequence_accept`) the pose graph gets loops (`graph`).
-Where nothing is recognised there is no loop, and the poses are those of the odometry.
+(`sequence_chain`); where a place is certain (`sequence_accept`) the pose graph gets loops
+(`graph`). Where nothing is recognised there is no loop, and the poses are those of the odometry.
 """
 
 from __future__ import annotations
@@ -30,11 +30,10 @@ from vibrissa.slam.interface import (
     SlamStep,
 )
 from vibrissa.slam.sequence_accept import find_members
-from vibrissa.slam.sequence_chain import Floats, Ints
 from vibrissa.slam.sequence_config import BATCH, SequenceConfig
 from vibrissa.slam.sequence_filter import Belief, SequenceFilter
 from vibrissa.slam.sequence_memory import WhiskMemory
-from vibrissa.slam.sequence_table import PER_RING, RINGS, WHISKERS
+from vibrissa.slam.sequence_table import PER_RING, RINGS, WHISKERS, Floats, Ints
 
 LARGEST_STEP: Final = 1e3
 """m and rad of one odometry step; beyond it something is broken."""
@@ -296,6 +295,7 @@ def _motion(odometry: Odometry) -> tuple[float, float]:
     for name, value, unit in zip(("distance", "turn"), motion, ("m", "rad"), strict=True):
         if not abs(value) <= LARGEST_STEP:
             raise SlamInputError(
-                f"odometry {name}: expected at most {LARGEST_STEP:g} {unit} per step, found {value:g}"
+                f"odometry {name}: expected at most {LARGEST_STEP:g} {unit} per step,"
+                f" found {value:g}"
             )
     return motion

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.numerics import compiled
-from vibrissa.slam.sequence_chain import OPPOSITE, SAME, Floats, Ints
+from vibrissa.slam.sequence_table import Floats, Ints
 
 
 @compiled
@@ -45,7 +45,6 @@ def find_members(
     centre = label[whisk[best]]
     faces = facing[whisk[best]] ^ best_row
     mass = 0.0
-    count = 0
     members[0, 0], members[0, 1] = best, best_row
     count = 1
     for row in range(2):
@@ -63,6 +62,3 @@ def find_members(
                 members[count, 0], members[count, 1] = j, row
                 count += 1
     return count if mass >= certain else 0
-
-
-__all__ = ["OPPOSITE", "SAME", "find_members"]

@@ -17,10 +17,10 @@ BATCH: Final = -1
 class SequenceConfig:
     """Parameters of the sequence SLAM, by name.
 
-    lag: whisks after which it is decided whether a whisk repeats an earlier one; 0 = at once, from
-        the past only; -1 = batch, in the map alone.
-    decide_every: whisks decided in one go, at most; the last of them a whisk later than `lag` says
-        none (the first has that much less foresight).
+    lag: whisks after which at the latest it is decided whether a whisk repeats an earlier one; 0 =
+        at once, from the past alone; -1 = batch, in the map alone.
+    decide_every: whisks decided in one go, at most, and at most a quarter of the lag; the last of
+        them has that much less foresight.
     evidence: factor on the learnt weights; far below 1, since whiskers and successive whisks tell
         nearly the same again and again.
     gap: whisks that must lie between a whisk and one it repeats, >= 2.
@@ -31,7 +31,8 @@ class SequenceConfig:
     share: least probability of a member that gets a loop, relative to the best.
     most_loops: members of a group that get a loop, at most.
     memory: whisks remembered; when full, half of them are forgotten (see sequence_memory).
-    window: whisks whose poses are estimated anew with every loop; older ones change in the map only.
+    window: whisks whose poses are estimated anew with every loop; older ones change in the map
+        alone.
     lateral: m, standard deviation of sideways motion per whisk.
     loop_place, loop_heading: m and rad, standard deviation of a loop.
     robust: chi^2 (3 degrees of freedom) at which a loop's pull is a quarter.

@@ -1,4 +1,4 @@
-"""The hidden chain run along a whole run: forward whisk by whisk, smoothed with a lag or in batch."""
+"""The hidden chain along a run: forward whisk by whisk, smoothed with a lag or in batch."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from typing import Final
 
 import numpy as np
 
-from vibrissa.slam.sequence_chain import Floats, backward, forward, likelihoods
+from vibrissa.slam.sequence_chain import backward, forward, likelihoods
 from vibrissa.slam.sequence_config import SequenceConfig
-from vibrissa.slam.sequence_memory import Ints, WhiskMemory
+from vibrissa.slam.sequence_memory import WhiskMemory
+from vibrissa.slam.sequence_table import Floats, Ints
 
 BLOCK: Final = 64
 """Whisks between two messages that a batch run keeps."""
@@ -27,7 +28,7 @@ class Belief:
 
     @property
     def states(self) -> int:
-        return self.known.shape[1]
+        return int(self.known.shape[1])
 
 
 class SequenceFilter:
@@ -127,8 +128,9 @@ class SequenceFilter:
                 likelihoods(table, self._factor, int(masks[t]), self._memory.kinds, like)
                 here = Belief(message, new, like)  # only its size and likelihoods are looked at
                 message, new = self.backward(here, message, new, int(states[t - 1]))
-        for start, belief in zip(range(0, n, BLOCK), beliefs, strict=True):
+        for start, before in zip(range(0, n, BLOCK), beliefs, strict=True):
             block = []
+            belief = before
             for t in range(start, min(start + BLOCK, n)):
                 belief = self.forward(belief, int(masks[t]), int(states[t]), table)
                 block.append(belief)

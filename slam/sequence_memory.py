@@ -1,4 +1,4 @@
-"""What a run remembers: its masks, the table learnt from them, and the whisks that may be repeated."""
+"""What a run remembers: its masks, the table they teach, and the whisks that may be repeated."""
 
 from __future__ import annotations
 
@@ -8,8 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.slam.growing import grown
-from vibrissa.slam.sequence_chain import Flags, Floats, Ints
-from vibrissa.slam.sequence_table import FARTHEST_OTHER, count_newest, empty_counts, weights
+from vibrissa.slam.sequence_chain import Flags
+from vibrissa.slam.sequence_table import (
+    FARTHEST_OTHER,
+    Floats,
+    Ints,
+    count_newest,
+    empty_counts,
+    weights,
+)
 
 VISIT: Final = 5
 """Neighbouring place labels that count as one place when visits are counted."""

@@ -2,11 +2,13 @@
 
 A mask is 18 bits, bit `6 ring + k` set when that whisker touched something in a whisk. Two masks
 compare whisker by whisker: none, one or both of the two in contact. The weight of an outcome is how
-much more often it occurs between neighbouring whisks, which feel nearly the same place, than between
-whisks a few steps further apart, which feel the same corridor but another place. Nearby whisks and
-not random ones are the background because corridors look alike. No ground truth is involved.
+much more often it occurs between neighbouring whisks, which feel nearly the same place, than
+between whisks a few steps further apart, which feel the same corridor but another place. Nearby
+whisks and not random ones are the background because corridors look alike. No ground truth is
+involved.
 
-When no whisker ever touches, or all always do, both frequencies agree exactly and every weight is 0.
+When no whisker ever touches, or all always do, both frequencies agree exactly and all weights are
+0.
 """
 
 from __future__ import annotations
