@@ -63,7 +63,7 @@ from vibrissa.rig.rows import (
 from vibrissa.rig.scene import GRID_REACH, TOP, index_cell
 
 LEAST_DROP = 0.001  # m, a pivot is taken to be at least this far above a wall's top
-MOST_ROOM = 0.02  # m, what is nearer to a wall's height counts as being beside it
+MOST_ROOM, LEAST_ROOM = 0.02, 1e-4  # m
 SLACK = 1e-6  # m, far above what rounding and the tables' ends can move
 MOST_LEAN = 2.0  # a whisker bent further sideways than this comes free in any case
 
@@ -378,8 +378,9 @@ def look_around(
 ) -> None:
     """Remember how far free whisker i is from what it could touch.
 
-    MARGIN: as it may turn, from boxes; ROOM: as it is, from boxes and floor. The part of it that is
-    well above a box is as far from that as it is above, the rest as far as seen from above.
+    MARGIN: as it may turn, from boxes; ROOM: as it is, from boxes and floor. Of a box, the part
+    that is some height above it is as far away as that, and the rest as far as seen from above;
+    the best of a few heights counts.
     """
     cell = index_cell(grid, px, py)
     length = head[at(LENGTH, i)]
@@ -393,13 +394,17 @@ def look_around(
             drop = max(pz - boxes[b, TOP], LEAST_DROP)
             above = drop - length * cos_phi
             if whole < room and above < room:
-                begin = 0.0
-                if cos_phi > 0.0:
-                    begin = min(max((drop - MOST_ROOM) / cos_phi, 0.0), length)
-                start = min(begin * sin_phi, length * sin_phi)
-                extent = (length - begin) * abs(sin_phi)
-                part = clearance(boxes, b, px + start * ux, py + start * uy, ux, uy, extent)
-                room = min(room, max(above, whole, min(part, MOST_ROOM)))
+                best, tall = max(above, whole), MOST_ROOM
+                while tall > best and tall > LEAST_ROOM:
+                    begin = 0.0
+                    if cos_phi > 0.0:
+                        begin = min(max((drop - tall) / cos_phi, 0.0), length)
+                    start = min(begin * sin_phi, length * sin_phi)
+                    extent = (length - begin) * abs(sin_phi)
+                    part = clearance(boxes, b, px + start * ux, py + start * uy, ux, uy, extent)
+                    best = max(best, min(part, tall))
+                    tall *= 0.25
+                room = min(room, best)
     memo[at(MARGIN, i)], memo[at(ROOM, i)] = margin - SLACK, room - SLACK
     memo[at(FROM_X, i)], memo[at(FROM_Y, i)], memo[at(FROM_Z, i)] = pose[0], pose[1], pose[2]
     memo[at(FROM_YAW, i)], memo[at(FROM_PHI, i)] = pose[3], phi
