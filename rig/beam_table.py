@@ -47,7 +47,7 @@ from vibrissa.rig.elastica import (
 
 Float64s = NDArray[np.float64]
 
-SIZE = 57
+SIZE = 73
 STEPS = 64  # of the shooting, far finer than the interpolation
 LEAST_Q = 0.1
 FLATTENING = 0.28125  # atan(x) is nearly x / (1 + FLATTENING x^2)
