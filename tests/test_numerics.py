@@ -30,6 +30,7 @@ from vibrissa.numerics import (
     atan2,
     compiled,
     cos,
+    cos_sin_turn,
     exp,
     hypot,
     log,
@@ -403,6 +404,29 @@ one = own[0]
 one[17] = np.nextafter(one[17], 2)
 print(hashlib.sha256(b"".join(r.tobytes() for r in own)).hexdigest())
 """
+
+
+@compiled
+def turns(u, c, s):
+    for i in range(u.shape[0]):
+        c[i], s[i] = cos_sin_turn(u[i])
+
+
+def test_cosine_and_sine_of_turns_are_within_two_units_in_the_last_place():
+    words = np.random.default_rng(3).integers(0, 2**32, 4000)
+    u = np.concatenate([(words + 0.5) * 2.0**-32, np.arange(-16, 17) / 8, [1e-9, 1234.56789]])
+    c, s = np.empty_like(u), np.empty_like(u)
+    turns(u, c, s)
+    with mp.workdps(60):
+        for k in range(len(u)):
+            for found, exact in (
+                (c[k], mp.cos(2 * mp.pi * mpf(u[k]))),
+                (s[k], mp.sin(2 * mp.pi * mpf(u[k]))),
+            ):
+                # The nearest double to a zero of either is zero.
+                assert abs(mpf(float(found)) - exact) <= 2 * math.ulp(float(exact)) + mpf(10) ** -50
+    one_by_one = [cos_sin_turn(value) for value in u.tolist()]
+    assert np.array(one_by_one).tobytes() == np.stack([c, s], axis=1).tobytes()
 
 
 def test_bits_do_not_depend_on_the_cpu_or_the_c_library(tmp_path):
