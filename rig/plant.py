@@ -7,152 +7,44 @@ numbers come in, samples and poses go out.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vibrissa.control.kinematics import WHISKERS, HeadGeometry, paper_head, ring_of
-from vibrissa.numerics import cos, sin
+from vibrissa.control.kinematics import WHISKERS
 from vibrissa.rig import head as h
-from vibrissa.rig.scene import Scene, build_scene
-from vibrissa.rig.whisker import SHAFT_ROWS, second_order_step, shaft_table
+from vibrissa.rig.head_params import (
+    HeadPlantParams,
+    PlantError,
+    check_range,
+    fresh_memo,
+    head_model,
+    rest_state,
+)
 
 Float32s = NDArray[np.float32]
 Float64s = NDArray[np.float64]
 Pose = tuple[float, float, float, float]
 
-WATCHDOG_TICKS = 40
+__all__ = [
+    "ARM_PERIOD",
+    "ARM_SECONDS",
+    "WATCHDOG_TICKS",
+    "ArmPlant",
+    "ArmPlantParams",
+    "HeadPlant",
+    "HeadPlantParams",
+    "PlantError",
+    "fresh_memo",
+    "head_model",
+    "rest_state",
+]
+
+WATCHDOG_SECONDS = 0.02
+WATCHDOG_TICKS = 40  # at 2 kHz
 ARM_PERIOD = 16  # ticks, 125 Hz
 ARM_SECONDS = ARM_PERIOD * h.TICK
-
-
-class PlantError(ValueError):
-    """A parameter or an input that the plant refuses; nothing has changed."""
-
-
-def _check_range(where: str, name: str, value: float, low: float, high: float, unit: str) -> None:
-    if not low <= value <= high:
-        raise PlantError(f"{where}.{name}: expected {low} to {high} {unit}, found {value}")
-
-
-@dataclass(frozen=True)
-class HeadPlantParams:
-    """What the simulated head is made of. Three-tuples are (front, mid, rear ring).
-
-    Raises PlantError for a value outside the range given here.
-
-    shaft_base_diameter  m, 0.1e-3 to 10e-3
-    shaft_tip_diameter   m, at least 0.1 of the base, at most the base
-    shaft_modulus        Pa, 1e8 to 1e12, Young's modulus
-    shaft_density        kg/m^3, 100 to 20000
-    shaft_damping        damping ratio of the first mode, 0.01 to 0.99
-    servo_frequency      Hz, 0.5 to 200, natural frequency of the position servo
-    servo_damping        damping ratio of the servo, 0.1 to 10
-    servo_stiffness      N m/rad, 1e-3 to 1e3, static: a moment M moves the servo by M / Kp
-    servo_speed          rad/s, 0.1 to 1000, speed limit
-    stop_margin          rad, 0 to 0.5, mechanical stops lie this far outside [0, swing]
-    retract_speed        rad/s, 0.01 to 100, speed of the watchdog's retraction
-    encoder_noise        rad, 0 to 0.1, standard deviation
-    sensor_noise         N m, 0 to 1e-2, standard deviation
-    sensor_drift         N m/sqrt(s), 0 to 1e-2, random walk of the bias
-    sensor_cross_talk    0 to 0.5, share of x seen in y and of y in x
-    sensor_full_scale    N m, 1e-5 to 10, readings are clipped here
-    sensor_resolution    N m per count, 0 to 1e-3, 0 for none
-    """
-
-    geometry: HeadGeometry = field(default_factory=paper_head)
-    shaft_base_diameter: tuple[float, float, float] = (0.8e-3, 1.3e-3, 1.6e-3)
-    shaft_tip_diameter: tuple[float, float, float] = (0.3e-3, 0.4e-3, 0.4e-3)
-    shaft_modulus: float = 3e9
-    shaft_density: float = 1200.0
-    shaft_damping: float = 0.15
-    servo_frequency: float = 10.0
-    servo_damping: float = 1.0
-    servo_stiffness: float = 0.3
-    servo_speed: float = 20.0
-    stop_margin: float = 0.087
-    retract_speed: float = 2.0
-    encoder_noise: float = math.radians(0.1)
-    sensor_noise: float = 1e-5
-    sensor_drift: float = 0.0
-    sensor_cross_talk: float = 0.0
-    sensor_full_scale: float = 0.03
-    sensor_resolution: float = 1e-6
-
-    def __post_init__(self) -> None:
-        ranges = {
-            "shaft_modulus": (1e8, 1e12, "Pa"),
-            "shaft_density": (100.0, 20000.0, "kg/m^3"),
-            "shaft_damping": (0.01, 0.99, ""),
-            "servo_frequency": (0.5, 200.0, "Hz"),
-            "servo_damping": (0.1, 10.0, ""),
-            "servo_stiffness": (1e-3, 1e3, "N m/rad"),
-            "servo_speed": (0.1, 1000.0, "rad/s"),
-            "stop_margin": (0.0, 0.5, "rad"),
-            "retract_speed": (0.01, 100.0, "rad/s"),
-            "encoder_noise": (0.0, 0.1, "rad"),
-            "sensor_noise": (0.0, 1e-2, "N m"),
-            "sensor_drift": (0.0, 1e-2, "N m/sqrt(s)"),
-            "sensor_cross_talk": (0.0, 0.5, ""),
-            "sensor_full_scale": (1e-5, 10.0, "N m"),
-            "sensor_resolution": (0.0, 1e-3, "N m"),
-        }
-        for name, (low, high, unit) in ranges.items():
-            _check_range("head plant", name, getattr(self, name), low, high, unit)
-        for name in ("shaft_base_diameter", "shaft_tip_diameter"):
-            if len(getattr(self, name)) != 3:
-                raise PlantError(
-                    f"head plant.{name}: expected 3 values (front, mid, rear), "
-                    f"found {len(getattr(self, name))}"
-                )
-        for base, tip in zip(self.shaft_base_diameter, self.shaft_tip_diameter, strict=True):
-            _check_range("head plant", "shaft_base_diameter", base, 0.1e-3, 10e-3, "m")
-            _check_range("head plant", "shaft_tip_diameter", tip, 0.1 * base, base, "m")
-
-
-def head_table(params: HeadPlantParams) -> Float64s:
-    """The parameters as ``head_step`` reads them, float64[HEAD_ROWS, 18]."""
-    g = params.geometry
-    rings = [ring_of(i) for i in range(WHISKERS)]
-    table = np.empty((h.HEAD_ROWS, WHISKERS), dtype=np.float64)
-    table[:SHAFT_ROWS] = shaft_table(
-        g.length,
-        np.array([params.shaft_base_diameter[r] for r in rings]),
-        np.array([params.shaft_tip_diameter[r] for r in rings]),
-        params.shaft_modulus,
-        params.shaft_density,
-        params.shaft_damping,
-        h.TICK,
-    )
-    table[h.PIVOT_RADIUS] = g.pivot_radius
-    table[h.PIVOT_HEIGHT] = g.pivot_height
-    table[h.AZIMUTH_COS] = [cos(a) for a in g.azimuth]
-    table[h.AZIMUTH_SIN] = [sin(a) for a in g.azimuth]
-    table[h.PHI_START] = g.phi_start
-    table[h.THETA_LOW] = -params.stop_margin
-    table[h.THETA_HIGH] = g.swing + params.stop_margin
-    servo = second_order_step(2 * math.pi * params.servo_frequency, params.servo_damping, h.TICK)
-    table[h.SERVO_EE : h.SERVO_WW + 1] = np.array(servo)[:, None]
-    table[h.COMPLIANCE] = 1.0 / params.servo_stiffness
-    table[h.SPEED_LIMIT] = params.servo_speed
-    table[h.RETRACT_STEP] = params.retract_speed * h.TICK
-    table[h.ENCODER_NOISE] = params.encoder_noise
-    table[h.SENSOR_NOISE] = params.sensor_noise
-    table[h.DRIFT_STEP] = params.sensor_drift * math.sqrt(h.DRIFT_TICKS * h.TICK)
-    table[h.CROSS_TALK] = params.sensor_cross_talk
-    table[h.FULL_SCALE] = params.sensor_full_scale
-    table[h.RESOLUTION] = params.sensor_resolution
-    return table
-
-
-def rest_state(params: HeadPlantParams) -> Float64s:
-    """State float64[STATE_ROWS, 18] of a head at rest at theta = 0, touching nothing."""
-    state = np.zeros((h.STATE_ROWS, WHISKERS), dtype=np.float64)
-    state[h.PSI] = params.geometry.phi_start
-    state[h.PEG] = -1
-    state[h.SIDE_BOX] = -1
-    return state
 
 
 class HeadPlant:
@@ -160,8 +52,8 @@ class HeadPlant:
 
     ``boxes`` float64[n, 5] as made by ``wall_boxes``, m; ``seed`` of the noise, 0 to 2^63 - 1.
     With ``skip`` off every whisker looks at every box; the samples are the same to the bit.
-    As in the firmware, when no command has come for 40 ticks (20 ms) the drives go back to
-    theta = 0 by themselves, at ``retract_speed``.
+    As in the firmware, when no command has come for 20 ms (40 ticks at 2 kHz) the drives go back
+    to theta = 0 by themselves, at ``retract_speed``.
     """
 
     def __init__(
@@ -170,11 +62,12 @@ class HeadPlant:
         if not 0 <= seed < 2**63:
             raise PlantError(f"head plant seed: expected 0 to 2^63 - 1, found {seed}")
         self.params = params or HeadPlantParams()
-        self.scene: Scene = build_scene(boxes, float(self.params.geometry.length.max()))
+        self.model = head_model(boxes, self.params)
         self.seed = seed
         self.skip = skip
         self.state = rest_state(self.params)
-        self._table = head_table(self.params)
+        self._memo = fresh_memo()
+        self._watchdog = max(1, round(WATCHDOG_SECONDS * self.params.rate))
         self._pose = np.zeros(4, dtype=np.float64)
         self._command = np.zeros(WHISKERS, dtype=np.float32)
         self._last_command_tick: int | None = None
@@ -200,19 +93,15 @@ class HeadPlant:
                     f"found {command.dtype}{list(command.shape)}"
                 )
             last_command_tick = tick
-        silent = last_command_tick is None or tick - last_command_tick >= WATCHDOG_TICKS
+        silent = last_command_tick is None or tick - last_command_tick >= self._watchdog
         self._pose[:] = pose
         theta = np.empty(WHISKERS, dtype=np.float32)
         x = np.empty(WHISKERS, dtype=np.float32)
         y = np.empty(WHISKERS, dtype=np.float32)
-        scene = self.scene
         status = h.head_step(
             self.state,
-            self._table,
-            scene.boxes,
-            scene.grid,
-            scene.starts,
-            scene.items,
+            self._memo,
+            self.model,
             self.skip,
             self.seed,
             tick,
@@ -260,7 +149,7 @@ class ArmPlantParams:
         tops = {"speed": 5.0, "acceleration": 100.0, "turn_speed": 20.0, "turn_acceleration": 500.0}
         for entry in fields(self):
             low = 0.001 if entry.name == "speed" else 0.01
-            _check_range(
+            check_range(
                 "arm plant", entry.name, getattr(self, entry.name), low, tops[entry.name], "(SI)"
             )
 

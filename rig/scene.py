@@ -15,12 +15,12 @@ from vibrissa.numerics import compiled
 from vibrissa.rig.maze import Maze
 
 INDEX_CELL = 0.03
-REACH_MARGIN = 0.001
+REACH_MARGIN = 0.03  # m, so that a whisker that reaches no box has some way to go
 
 # Columns of Scene.boxes, m.
 X_MIN, X_MAX, Y_MIN, Y_MAX, TOP = range(5)
 # Entries of Scene.grid.
-GRID_X, GRID_Y, GRID_COLUMNS, GRID_ROWS, GRID_TOP = range(5)
+GRID_X, GRID_Y, GRID_COLUMNS, GRID_ROWS, GRID_TOP, GRID_REACH = range(6)
 
 
 class SceneError(ValueError):
@@ -31,9 +31,10 @@ class SceneError(ValueError):
 class Scene:
     """Boxes standing on the floor, world frame, and the index over them.
 
-    ``boxes`` float64[n, 5]: x_min, x_max, y_min, y_max, top in m. ``grid`` float64[5]: south-west
-    corner of the index (m), its columns and rows, highest top (m). Index cell c holds the boxes
-    ``items[starts[c]:starts[c + 1]]`` (int32), all those within ``reach`` m of the cell.
+    ``boxes`` float64[n, 5]: x_min, x_max, y_min, y_max, top in m. ``grid`` float64[6]: south-west
+    corner of the index (m), its columns and rows, highest top (m), and the distance (m) within
+    which every box is listed. Index cell c holds the boxes ``items[starts[c]:starts[c + 1]]``
+    (int32); a point outside the index is farther than that distance from all boxes.
     """
 
     boxes: NDArray[np.float64]
@@ -104,7 +105,11 @@ def build_scene(boxes: NDArray[np.float64], reach: float) -> Scene:
     boxes = np.ascontiguousarray(boxes, dtype=np.float64)
     if not len(boxes):
         return Scene(
-            boxes, np.zeros(5), np.zeros(1, dtype=np.int32), np.zeros(0, dtype=np.int32), reach
+            boxes,
+            np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1e3]),
+            np.zeros(1, dtype=np.int32),
+            np.zeros(0, dtype=np.int32),
+            reach,
         )
     margin = reach + REACH_MARGIN
     x0, y0 = boxes[:, X_MIN].min() - margin, boxes[:, Y_MIN].min() - margin
@@ -124,7 +129,7 @@ def build_scene(boxes: NDArray[np.float64], reach: float) -> Scene:
     starts = np.zeros(columns * rows + 1, dtype=np.int32)
     starts[1:] = np.cumsum([len(entry) for entry in lists])
     items = np.array([n for entry in lists for n in entry], dtype=np.int32)
-    grid = np.array([x0, y0, columns, rows, boxes[:, TOP].max()], dtype=np.float64)
+    grid = np.array([x0, y0, columns, rows, boxes[:, TOP].max(), margin], dtype=np.float64)
     return Scene(boxes, grid, starts, items, reach)
 
 

@@ -7,12 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import settings
 
 from vibrissa.messages.log_format import Record
 from vibrissa.messages.log_reader import LogReader
 from vibrissa.processes.config import Experiment, load_experiment
 from vibrissa.processes.simulate import simulate
 from vibrissa.processes.supervisor import run_live
+
+# The first call of a compiled function compiles it, however long that takes.
+settings.register_profile("vibrissa", deadline=None)
+settings.load_profile("vibrissa")
 
 SHORT = """\
 [run]

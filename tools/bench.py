@@ -87,6 +87,7 @@ BENCHES: Final[dict[str, str]] = {
     "swap": "vibrissa.tools.bench_swap:bench",
     "slam": "vibrissa.tools.bench_slam:bench",
     "slam-stress": "vibrissa.tools.bench_slam_stress:bench",
+    "experiment": "vibrissa.tools.bench_experiment:bench",
 }
 """name -> where its function is, imported when it is asked for."""
 

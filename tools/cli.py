@@ -11,6 +11,7 @@ import typer
 from vibrissa import __version__
 from vibrissa.tools import bench, control, doctor, export, logs, new_controller, rerun, run, tune
 from vibrissa.tools.console import fail
+from vibrissa.tools.experiment import command as experiment
 
 FAILED = 1
 """Exit code of a run that ended early, a re-run that diverged, a log that lost something."""
@@ -45,7 +46,7 @@ def _root(
     pass
 
 
-for room in (run, control, new_controller, rerun, logs, tune, export, bench, doctor):
+for room in (run, control, new_controller, rerun, logs, tune, export, experiment, bench, doctor):
     for verb, example in room.VERBS:
         app.command(example.split()[1], epilog=f"Example: `{example}`")(verb)
 

@@ -1,0 +1,1 @@
+"""The paper's experiment: open loop against RCP, max angle against contact angle, with controls."""

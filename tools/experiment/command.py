@@ -1,0 +1,51 @@
+"""`vibrissa experiment`: run the paper's experiment and write its results and report."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vibrissa.tools.console import Json, print_json, stdout
+
+SHOWN = ("arr", "em_experience_interval")
+
+
+def experiment(
+    name: Annotated[str, typer.Argument(help="Only `paper`: Salman and Pearson's experiment.")],
+    seeds: Annotated[int, typer.Option(min=1, max=1000, help="Runs of the whole.")] = 5,
+    jobs: Annotated[int, typer.Option(min=0, help="Processes; 0: one per core.")] = 0,
+    out: Annotated[
+        Path, typer.Option(help="Directory for results.json, report.html and the cache.")
+    ] = Path("runs/paper"),
+    quick: Annotated[
+        bool, typer.Option("--quick", help="A fast head and fewer circuits: a look, no claim.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Reproduce the paper: open loop against RCP, max angle against contact angle, with controls.
+
+    An interrupted run goes on where it stopped; what is in the cache is not run again.
+    """
+    if name != "paper":
+        raise typer.BadParameter(f"no experiment {name!r}; there is `paper`")
+    from vibrissa.tools.experiment.design import NOISE, scale
+    from vibrissa.tools.experiment.paper import run_paper
+
+    results = run_paper(scale(seeds, quick), jobs or len(os.sched_getaffinity(0)), out)
+    if as_json:
+        print_json(results)
+        return
+    console = stdout()
+    for row in results["effects"]:
+        if row["noise"] == NOISE and row["score"] in SHOWN:
+            console.print(
+                f"{row['effect']}: {row['score']} {row['a']:.4g} -> {row['b']:.4g} "
+                f"({row['up']} up, {row['down']} down of {row['n']}): {row['reading']}"
+            )
+    console.print(f"{out / 'report.html'}  {results['timing']['wall_s']:.0f} s")
+
+
+VERBS = ((experiment, "vibrissa experiment paper --quick --out runs/quick"),)
