@@ -7,7 +7,8 @@ something meanwhile would raise its own threshold and go blind; such a calibrati
 Touch is told from the signals alone. Signals are averaged over blocks of 10 ms, which leaves of
 white noise about a fifth, and three things are checked in x and in y of every whisker:
 
-    excursion     a block mean leaves the whisker's own median block mean
+    excursion     a block mean leaves the whisker's own median block mean, by more than the inertia
+                  of the whisker explains at the whisk's largest acceleration
     offset        the whisker's median leaves the median of its ring, of those without excursion
                   (a whisker pressed against a wall all the time; weight is the same for all six)
     ring offset   that median of the ring leaves zero (the whole ring pressed)
@@ -29,6 +30,7 @@ from vibrissa.control.kinematics import (
     WHISKERS,
     Float32s,
     Float64s,
+    HeadGeometry,
     per_whisker,
     whisker_name,
 )
@@ -40,6 +42,8 @@ DERIVATIVE_SIGMAS = 8.0
 TICK_MS = 0.5
 FAST_MS, SLOW_MS = 5.0, 15.0  # time constants of the derivative channel
 CHANNELS = ("x", "y")
+INERTIA = 1.5e-4
+"""kg, a whisker's moment of inertia about its base over the cube of its length, at most."""
 
 # rows of the accumulator, float64[ROWS, 2 channels, 18]
 MEAN, SQUARES, PREVIOUS, BEFORE, BLOCK_SUM, BLOCK_ROUGHNESS = range(6)
@@ -84,6 +88,17 @@ class TouchLimits:
     excursion: float = 5e-5
     offset: float = 8e-5
     ring_offset: float = 5e-4
+
+
+def inertial_moment(geometry: HeadGeometry, period_ticks: int) -> Float64s:
+    """What a whisker's own inertia makes of the whisk, at most: float64[18], N m.
+
+    INERTIA length^3 times the largest acceleration of the whisk, swing / 2 (2 pi / period)^2.
+    """
+    rate = 2.0 * math.pi * 1000.0 / (period_ticks * TICK_MS)
+    cube = geometry.length * geometry.length * geometry.length
+    moment: Float64s = INERTIA * cube * (geometry.swing / 2.0 * rate * rate)
+    return moment
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,12 +181,18 @@ def _accumulate(
 class Calibrator:
     """Collects `cycles` whole whisk cycles of free whisking, one sample or one block at a time.
 
-    Blocks and single samples give the same bits. Raises CalibrationError for a calibration of no
-    cycle or of cycles shorter than one averaging block.
+    inertial: float64[18] N m, how much further than its limit an excursion may go because the
+    whisker is accelerated (`inertial_moment`); none by default. Blocks and single samples give the
+    same bits. Raises CalibrationError for a calibration of no cycle or of cycles shorter than one
+    averaging block.
     """
 
     def __init__(
-        self, cycles: int = 12, period_ticks: int = 2000, limits: TouchLimits | None = None
+        self,
+        cycles: int = 12,
+        period_ticks: int = 2000,
+        limits: TouchLimits | None = None,
+        inertial: Float64s | float = 0.0,
     ) -> None:
         if cycles < 1:
             raise CalibrationError(f"calibration: {cycles} cycles, expected >= 1")
@@ -180,6 +201,7 @@ class Calibrator:
         self.needed = cycles * period_ticks
         self.seen = 0
         self._limits = limits or TouchLimits()
+        self._inertial = per_whisker(inertial, "inertial", CalibrationError)
         self._fast = 1.0 - exp(-TICK_MS / FAST_MS)
         self._slow = 1.0 - exp(-TICK_MS / SLOW_MS)
         self._moments = np.zeros((ROWS, len(CHANNELS), WHISKERS), dtype=np.float64)
@@ -280,8 +302,9 @@ class Calibrator:
         for c, channel in enumerate(CHANNELS):
             for ring in rings:
                 sigma = float(np.median(noise[c, ring]))
-                limit = max(limits.noise_multiple * sigma, limits.excursion)
+                least = max(limits.noise_multiple * sigma, limits.excursion)
                 for i in ring:
+                    limit = least + float(self._inertial[i])
                     away = self._block_mean[c, i] - median[c, i]
                     excursion = float(away[int(np.abs(away).argmax())])
                     judge(i, channel, "excursion", excursion, limit)

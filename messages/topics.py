@@ -37,6 +37,8 @@ _ROWS: Final = (
     Topic("arm.setpoint", types.ArmSetpoint, 125, "arm"),
     Topic("slam.view", types.SlamView, 1, "slam"),
     Topic("slam.pose", types.SlamPose, 1, "slam"),
+    Topic("slam.owner", types.Ownership, 0, "slam"),
+    Topic("slam.history", types.SlamHistory, 0, "slam"),
     Topic("slam.map", types.SlamMap, 0.1, "slam"),
     Topic("eval.metrics", types.Metrics, 0.1, "slam"),
     Topic("run.event", types.Event, 0, "supervisor"),

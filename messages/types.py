@@ -155,7 +155,7 @@ class SlamView:
     max_angle_gated: Pixels
     max_angle_ungated: Pixels
     contact_angle: Pixels
-    template: Annotated[int, Int(0, 2**31)]
+    template: Annotated[int, Int(-1, 2**31, "-1 for none")]
     new: Annotated[int, Int(0, 1)]
     error: Annotated[float, Real(1e6, "mean absolute pixel difference, -1 for none compared")]
 
@@ -171,6 +171,21 @@ class SlamPose:
     estimate: Annotated[F64, f64(3, limit=1e6, unit="m, m, rad in the map frame")]
     odometry: Annotated[F64, f64(3, limit=1e6, unit="m/s, rad/s, s")]
     truth: Pose
+
+
+@dataclass(slots=True, eq=False)
+class SlamHistory:
+    """What was seen so far, in parts, for a SLAM that comes later; one row per whisk cycle."""
+
+    version: ClassVar[int] = 1
+    request: Annotated[int, Int(0, 2**31)]
+    node: Annotated[str, Text(40)]
+    first: Annotated[int, Int(0, 2**31, "cycles seen before this part")]
+    total: Annotated[int, Int(0, 2**31, "cycles seen in all parts")]
+    cycles: Annotated[I32, Array("<i4", (-1,))]
+    images: Annotated[U8, Array("|u1", (-1, WHISKERS), unit="tip height code, 0 = no contact")]
+    odometry: Annotated[F64, f64(-1, 3, limit=1e6, unit="m/s, rad/s, s")]
+    truth: Annotated[F64, f64(-1, 4, limit=1e3, unit="m, m, m, rad")]
 
 
 @dataclass(slots=True, eq=False)
@@ -217,11 +232,11 @@ class Order:
     version: ClassVar[int] = 1
     request: Annotated[int, Int(0, 2**31, "number of the request; answers repeat it")]
     kind: Annotated[str, Text(40)]
-    """open, assign, register, swap, rollback, forget, set"""
+    """open, assign, register, swap, rollback, forget, set, close"""
     node: Annotated[str, Text(40)]
     """Who is to obey: "sampler" for the arbiter's orders, else the node concerned."""
     name: Annotated[str, Text(200)]
-    """The controller, slot or parameter that is meant."""
+    """The controller, SLAM, circuits, slot or parameter that is meant."""
     value: Annotated[str, Text(2000)]
     """A parameter's value, or parameters of a controller, as JSON."""
     at: TickOrNone
@@ -243,7 +258,10 @@ class Answer:
 
 @dataclass(slots=True, eq=False)
 class Ownership:
-    """From `tick` on the drives obey `controller`, the source of commands of that epoch."""
+    """From `tick` on the drives obey `controller`, the source of commands of that epoch.
+
+    On slam.owner: from `tick` on the run's pose and map are those of the SLAM `controller`.
+    """
 
     version: ClassVar[int] = 1
     tick: Tick

@@ -52,24 +52,29 @@ class Client:
         """What is installed and what is loaded, with the state and record of each."""
         return self._ask("controllers")[1]
 
-    def load(self, name: str, **parameters: float | bool | str) -> str:
-        """Have a controller answer in shadow, beside the one that has the drives."""
-        return self._ask("load", name=name, parameters=_as_json(parameters))[0]
+    def load(self, name: str, *, node: str = "whisk", **parameters: float | bool | str) -> str:
+        """Have a controller answer in shadow, or (node "slam") a SLAM, beside the active one."""
+        return self._ask("load", name=name, node=node, parameters=_as_json(parameters))[0]
 
     def swap(
         self,
         name: str,
         when: str = "now",
         blend: float = 0.0,
+        *,
+        node: str = "whisk",
         **parameters: float | bool | str,
     ) -> str:
         """Give the drives to a controller, loading it first if need be.
 
-        when: "now" or "cycle" (at the start of the next whisk cycle); blend: s.
+        when: "now" or "cycle" (at the start of the next whisk cycle); blend: s. With node "slam",
+        make another SLAM the run's from the next whisk cycle on; with node "arm", `name` is the
+        circuits (letters C and A) that take the place of those that have not begun.
         """
         return self._ask(
             "swap",
             name=name,
+            node=node,
             when=when,
             blend=blend,
             parameters=_as_json(parameters),
@@ -79,9 +84,9 @@ class Client:
         """Give the drives back to the previous controller."""
         return self._ask("rollback")[0]
 
-    def unload(self, name: str) -> str:
-        """End a controller in shadow."""
-        return self._ask("unload", name=name)[0]
+    def unload(self, name: str, *, node: str = "whisk") -> str:
+        """End a controller (node "slam": a SLAM) in shadow."""
+        return self._ask("unload", name=name, node=node)[0]
 
     def set(self, node: str, key: str, value: float | bool | str) -> str:
         """Change a parameter of a running node."""

@@ -93,6 +93,7 @@ class Arm(Section):
 class Slam(Section):
     """[slam]"""
 
+    algorithm: Annotated[str, Field(description="ratslam, or one that was added")] = "ratslam"
     image: Annotated[
         Literal["max_angle_gated", "max_angle_ungated", "contact_angle"],
         Field(description="gated: still in contact near full protraction"),
@@ -105,10 +106,14 @@ class Slam(Section):
 
 
 class Swap(Section):
-    """[[swap]]: a controller that takes over at the start of a whisk cycle."""
+    """[[swap]]: a controller, SLAM or circuits that take over at the start of a whisk cycle."""
 
+    node: Annotated[
+        Literal["whisk", "slam", "arm"],
+        Field(description="whose: whisk controller, SLAM, or the arm's circuits, e.g. to = 'CCA'"),
+    ] = "whisk"
     at_cycle: Annotated[int, Field(ge=1, le=10**7)]
-    to: Annotated[str, Field(min_length=1, max_length=40, description="name of a controller")]
+    to: Annotated[str, Field(min_length=1, max_length=100, description="name of a controller")]
     blend: Annotated[float, Field(ge=0, le=10, description="s, from old command to new")] = 0.0
 
 
@@ -127,6 +132,13 @@ class Experiment(Section):
             Annotated[str, Field(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")],
         ],
         Field(description='[controllers]: name = "module:Class"'),
+    ] = {}
+    slams: Annotated[
+        dict[
+            Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,39}$")],
+            Annotated[str, Field(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")],
+        ],
+        Field(description='[slams]: name = "module:Class"'),
     ] = {}
     swap: list[Swap] = []
 
@@ -157,9 +169,12 @@ class Experiment(Section):
                 if node in seen:
                     raise ValueError(f"run.together: {node!r} is named twice")
                 seen.add(node)
-        cycles = [swap.at_cycle for swap in self.swap]
-        if any(later - earlier < 2 for earlier, later in itertools.pairwise(cycles)):
-            raise ValueError("swap: expected at_cycle to grow by at least 2 from entry to entry")
+        for node in ("whisk", "slam", "arm"):
+            cycles = [swap.at_cycle for swap in self.swap if swap.node == node]
+            if any(later - earlier < 2 for earlier, later in itertools.pairwise(cycles)):
+                raise ValueError(
+                    f"swap: expected at_cycle of {node} to grow by at least 2 from entry to entry"
+                )
         return self
 
 
@@ -221,19 +236,24 @@ def load_experiment(
 
 def _check_parts(experiment: Experiment, where: str) -> None:
     """What only the nodes' own modules can judge: maze, circuit, controller, RatSLAM parameters."""
+    from vibrissa.processes import controllers, slams
     from vibrissa.processes.arm import make_path
-    from vibrissa.processes.controllers import available
-    from vibrissa.processes.slam import make_slam_config
 
-    known = available(experiment)
-    named = [("whisk.controller", experiment.whisk.controller)]
-    named += [("swap.to", swap.to) for swap in experiment.swap]
-    for key, name in named:
-        if name not in known:
-            raise RunError(f"{where}: {key} {name!r}: expected one of {', '.join(known)}")
+    known = {"whisk": controllers.available(experiment), "slam": slams.available(experiment)}
+    named = [
+        ("whisk", "whisk.controller", experiment.whisk.controller),
+        ("slam", "slam.algorithm", experiment.slam.algorithm),
+    ]
+    named += [(swap.node, "swap.to", swap.to) for swap in experiment.swap if swap.node in known]
+    for node, key, name in named:
+        if name not in known[node]:
+            raise RunError(f"{where}: {key} {name!r}: expected one of {', '.join(known[node])}")
     try:
         make_path(experiment)
-        make_slam_config(experiment)
+        for swap in experiment.swap:
+            if swap.node == "arm":
+                make_path(experiment, swap.to)
+        slams.make_slam_config(experiment)
     except (ValueError, RunError) as error:
         raise RunError(f"{where}: {error}") from None
 

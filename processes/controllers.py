@@ -86,21 +86,22 @@ def make_controller(name: str, experiment: Experiment, parameters: str = "") -> 
 
 def _maker(name: str, experiment: Experiment) -> Maker:
     if name in experiment.controllers:
-        return _imported(name, experiment.controllers[name])
+        return imported("controller", name, experiment.controllers[name])
     if name in BUILT_IN:
         return BUILT_IN[name]
     points = importlib.metadata.entry_points(group=ENTRY_POINTS, name=name)
     for point in points:
-        return _imported(name, point.value)
+        return imported("controller", name, point.value)
     raise RunError(
-        f"controller {name!r}: unknown, expected one of {', '.join(available(experiment))}"
+        f"controller {name} is not installed; installed are {', '.join(available(experiment))}"
     )
 
 
-def _imported(name: str, target: str) -> Maker:
+def imported(what: str, name: str, target: str) -> Callable[..., Any]:
+    """The class that "module:Class" names. Raises RunError that says `what` `name` is."""
     module, _, attribute = target.partition(":")
     try:
-        maker: Maker = getattr(importlib.import_module(module), attribute)
+        maker: Callable[..., Any] = getattr(importlib.import_module(module), attribute)
     except Exception as error:  # whatever a stranger's module raises on import
-        raise RunError(f"controller {name} ({target}): {type(error).__name__}: {error}") from None
+        raise RunError(f"{what} {name} ({target}): {type(error).__name__}: {error}") from None
     return maker

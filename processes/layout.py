@@ -9,7 +9,7 @@ from pathlib import Path
 
 from vibrissa.messages.topics import TOPICS
 from vibrissa.messages.transport import BUNDLE
-from vibrissa.processes.table import PUBLISHED_BY_HOSTS, ROWS, SLOTS
+from vibrissa.processes.table import ALL_SLOTS, PUBLISHED_BY_HOSTS, ROWS
 
 SUPERVISOR_SAYS = ("run.calibration", "run.event", "run.order")
 SUPERVISOR_HEARS = (
@@ -18,6 +18,7 @@ SUPERVISOR_HEARS = (
     "node.answer",
     "node.event",
     "node.telemetry",
+    "slam.owner",
     "whisk.calibration",
     "whisk.failure",
 )
@@ -74,7 +75,7 @@ class Layout:
 
     def _publishers(self) -> list[str]:
         """Everybody who may publish in this run, slots that are empty yet included."""
-        return list(dict.fromkeys(["supervisor", *self.hosts, *SLOTS]))
+        return list(dict.fromkeys(["supervisor", *self.hosts, *ALL_SLOTS]))
 
     def bundled(self, process: str) -> bool:
         """Whether a process takes what it hears in bundles: nothing in it reacts at once."""

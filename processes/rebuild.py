@@ -10,7 +10,7 @@ from vibrissa.messages.log_reader import LogReader
 from vibrissa.processes import provenance
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.node import Node, Stepper
-from vibrissa.processes.results import UnusableLogError
+from vibrissa.processes.results import RunError, UnusableLogError
 from vibrissa.processes.table import PROCESSES, build
 
 Replacements = Mapping[str, str]
@@ -22,7 +22,7 @@ def make_stepper(name: str, experiment: Experiment, replacements: Replacements) 
     if name not in replacements:
         try:
             return Stepper(name, build(name, experiment))
-        except ValueError as error:
+        except (ValueError, RunError) as error:
             raise UnusableLogError(f"{name} can't be made from the experiment: {error}") from None
     return Stepper(name, load_node(name, replacements[name], experiment))
 

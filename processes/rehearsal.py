@@ -13,21 +13,24 @@ import numpy as np
 
 from vibrissa.control.kinematics import NOSE_HEIGHT
 from vibrissa.messages import types
-from vibrissa.messages.codec import CODECS
+from vibrissa.messages.codec import CODECS, Message
 from vibrissa.messages.types import TICK_NS, WHISKERS
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.node import Node, Stepper
-from vibrissa.processes.table import ROWS, SLOTS, build
+from vibrissa.processes.results import RunError
+from vibrissa.processes.table import ROWS, SLAM_SLOTS, SLOTS, build
 
 TICKS = 1600
 PERIOD = 400
 ARM_TICKS = 16
+FAILURE = b"whisk.failure\0"
 
 
 def rehearse(name: str, experiment: Experiment, controller: str | None = None) -> None:
     """Step a throw-away copy of a node through a short made-up run.
 
     A slot is rehearsed as the run's first whisk process with the controller it is meant for.
+    Raises RunError when the controller fails in it.
     """
     changes: dict[str, Any] = {"period": PERIOD / types.TICK_HZ, "calibration_cycles": 1}
     if name in SLOTS:
@@ -38,16 +41,23 @@ def rehearse(name: str, experiment: Experiment, controller: str | None = None) -
             "whisk": experiment.whisk.model_copy(update=changes),
         }
     )
-    rehearse_node(name, build(name, short))
+    node = build(name, short)
+    if name in SLAM_SLOTS:
+        order = types.Order(0, "assign", name, controller or experiment.slam.algorithm, "", -1, 0)
+        node.step(Message("run.order", "supervisor", 0, 0, 0, order))
+    rehearse_node(name, node)
 
 
 def rehearse_node(name: str, node: Node) -> None:
-    """Step a throw-away node as if it were `name` in a short run."""
+    """Step a throw-away node as if it were `name` in a short run. Raises RunError if it fails."""
     stepper = Stepper(name, node)
     hears = set(ROWS[name].hears)
     for topic, source, seq, t, body in _made_up_run():
         if topic in hears:
-            stepper.step(CODECS[topic].encode(source, 0, seq, t, body))
+            step = stepper.step(CODECS[topic].encode(source, 0, seq, t, body))
+            for output in step.outputs:
+                if output.startswith(FAILURE):
+                    raise RunError(CODECS["whisk.failure"].decode(output).body.cause)
 
 
 def _made_up_run() -> Iterator[tuple[str, str, int, int, Any]]:

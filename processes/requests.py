@@ -15,9 +15,9 @@ from typing import Any, Final, Protocol
 from vibrissa.messages.codec import Message
 from vibrissa.messages.types import TICK_HZ, Order, Telemetry
 from vibrissa.processes.config import Experiment, Swap
-from vibrissa.processes.controllers import available
+from vibrissa.processes.kinds import Kind, of_controllers, of_slams
 from vibrissa.processes.results import RunError
-from vibrissa.processes.table import PROCESSES, SLOTS
+from vibrissa.processes.table import ALL_SLOTS, PROCESSES
 
 NEXT_CYCLE: Final = "cycle"
 PATIENCE_TICKS: Final = 2000
@@ -28,6 +28,8 @@ RETRY_TICKS: Final = 200
 ANSWER_PATIENCE_TICKS: Final = 20_000
 LONG: Final = ("parameters", "value")
 """Arguments that may have 2000 characters; others have at most 200."""
+PATIENCE_CYCLES: Final = 4
+HAND_OVERS: Final = 10
 NO_PARAMETERS: Final = {"rig", "sampler", "arm", "slam"}
 
 Program = Generator[None, None, str]
@@ -57,13 +59,6 @@ class Run(Protocol):
         """Repeat the calibration for newcomers; False when there is none yet."""
 
 
-def scheduled_slots(experiment: Experiment) -> dict[str, str]:
-    """slot -> controller for everything the experiment's schedule will load, in its order."""
-    wanted = dict.fromkeys(swap.to for swap in experiment.swap)
-    wanted.pop(experiment.whisk.controller, None)
-    return dict(zip(SLOTS, wanted, strict=False))
-
-
 class Requests:
     """All requests of a run, and what they have loaded."""
 
@@ -72,14 +67,12 @@ class Requests:
         self._programs: list[tuple[Program, Reply]] = []
         self._answers: dict[int, list[tuple[bool, str]]] = {}
         self._number = 0
-        self.slots: dict[str, str] = {"whisk": run.experiment.whisk.controller}
+        self._whisks, self._slams = of_controllers(run.experiment), of_slams(run.experiment)
+        self.slots = self._whisks.slots
         """slot -> controller, of everything that has the drives or is in shadow"""
-        self._used: list[str] = []
         self._loading: list[str] = []
         self._ready: dict[str, float] = {}
-        self.owner = "whisk"
         self.shadows: dict[str, dict[str, Any]] = {}
-        self._installed = available(run.experiment)
 
     def ask(self, verb: str, arguments: dict[str, Any], reply: Reply) -> None:
         """Begin a request; `reply` is called once, at its end."""
@@ -138,7 +131,9 @@ class Requests:
             case "node.answer":
                 self._answers.setdefault(body.request, []).append((bool(body.accepted), body.text))
             case "head.owner":
-                self.owner = body.controller
+                self._whisks.owner = body.controller
+            case "slam.owner":
+                self._slams.owner = body.controller
             case "node.telemetry" if message.source in self.slots:
                 self._measured(message.source, body)
             case "head.shadow":
@@ -156,12 +151,13 @@ class Requests:
 
     def lost(self, slot: str) -> None:
         """The process of a slot is gone."""
-        self.slots.pop(slot, None)
+        for kind in (self._whisks, self._slams):
+            kind.slots.pop(slot, None)
         self.shadows.pop(slot, None)
 
     def failed(self, slot: str) -> None:
         """The controller in a slot failed; it is not asked again, and its slot ends."""
-        if slot in SLOTS:
+        if slot in ALL_SLOTS:
             self._order("close", slot, "")
         self.lost(slot)
 
@@ -171,39 +167,84 @@ class Requests:
             {
                 "slot": slot,
                 "controller": controller,
-                "state": "active" if slot == self.owner else "shadow",
+                "state": "active" if slot == kind.owner else "shadow",
                 **self.shadows.get(slot, {}),
                 **({"ready_us": self._ready[slot]} if slot in self._ready else {}),
             }
-            for slot, controller in self.slots.items()
+            for kind in (self._whisks, self._slams)
+            for slot, controller in kind.slots.items()
         ]
-        return {"installed": self._installed, "loaded": loaded}
+        installed = {"installed": self._whisks.installed, "slams": self._slams.installed}
+        return installed | {"loaded": loaded}
 
     def _list(self) -> Program:
         yield
-        self._installed = available(self._run.experiment)
-        return f"{len(self.slots)} loaded, {self.owner} has the drives"
+        for kind in (self._whisks, self._slams):
+            kind.installed = kind.available(self._run.experiment)
+        return f"{len(self.slots)} loaded, {self._whisks.owner} has the drives"
 
-    def _load(self, name: str, parameters: str = "") -> Program:
-        slot = yield from self._loaded(name, parameters)
-        return f"{self.slots[slot]} ({slot}) answers in shadow"
+    def _kind(self, node: str) -> Kind:
+        kinds = {"whisk": self._whisks, "slam": self._slams}
+        if node not in kinds:
+            raise RunError(f"node {node!r}: expected one of {', '.join(kinds)}")
+        return kinds[node]
+
+    def _load(self, name: str, parameters: str = "", node: str = "whisk") -> Program:
+        kind = self._kind(node)
+        slot = yield from self._loaded(kind, name, parameters)
+        if slot not in kind.slots:
+            raise RunError(f"{name} failed as soon as it was loaded")
+        return f"{kind.slots[slot]} ({slot}) answers in shadow"
 
     def _swap(
-        self, name: str, when: str = "now", blend: float = 0.0, parameters: str = ""
+        self,
+        name: str,
+        when: str = "now",
+        blend: float = 0.0,
+        parameters: str = "",
+        node: str = "whisk",
     ) -> Program:
+        if node in ("slam", "arm"):
+            if blend:
+                raise RunError(f"swap: {node} is swapped between cycles, without a blend")
+            return (yield from self._swap_between(node, name, parameters, -1))
         if when not in ("now", NEXT_CYCLE):
             raise RunError(f"swap: when is {when!r}, expected now or {NEXT_CYCLE}")
         if isinstance(blend, str) or not 0 <= blend <= 1:
             raise RunError(f"swap: blend is {blend} s, expected 0 to 1")
-        slot = yield from self._loaded(name, parameters)
+        slot = yield from self._loaded(self._kind(node), name, parameters)
         return (yield from self._switch(slot, -1, when == NEXT_CYCLE, blend))
+
+    def _swap_between(self, node: str, name: str, parameters: str, at: int) -> Program:
+        """Swap what moves nothing by itself: the node concerned does it between two cycles."""
+        if node == "arm" and parameters:
+            raise RunError("swap: circuits of the arm have no parameters")
+        target, what = name, name
+        if node == "slam":
+            target = yield from self._loaded(self._slams, name, parameters)
+            what = f"{self._slams.slots.get(target, target)} ({target})"
+        deadline = self._run.tick + PATIENCE_CYCLES * self._run.experiment.period_ticks
+        while True:
+            number = self._order("swap", node, target, at=at)
+            accepted, text = yield from self._answer(number)
+            if accepted:
+                return f"{what} {text}"
+            if not text.startswith(WORTH_RETRYING) or self._run.tick > deadline:
+                raise RunError(f"swap of {node} to {what} refused: {text}")
+            yield from self._wait(RETRY_TICKS)
 
     def _scheduled(self, swap: Swap) -> Program:
         period = self._run.experiment.period_ticks
-        slot = yield from self._loaded(swap.to, "")
         at = swap.at_cycle * period
+        slot = (
+            ""
+            if swap.node == "arm"
+            else (yield from self._loaded(self._kind(swap.node), swap.to, ""))
+        )
         while self._run.tick < at - period:
             yield
+        if swap.node != "whisk":
+            return (yield from self._swap_between(swap.node, slot or swap.to, "", at))
         return (yield from self._switch(slot, at, False, swap.blend))
 
     def _switch(self, slot: str, at: int, at_cycle: bool, blend: float) -> Program:
@@ -218,9 +259,7 @@ class Requests:
                 break
             if not text.startswith(WORTH_RETRYING) or self._run.tick > deadline:
                 raise RunError(f"swap to {self.slots.get(slot, slot)} refused: {text}")
-            again = self._run.tick + RETRY_TICKS
-            while self._run.tick < again:
-                yield
+            yield from self._wait(RETRY_TICKS)
         accepted, text = yield from self._switched(number, at)
         if not accepted:
             raise RunError(f"swap to {self.slots.get(slot, slot)} refused: {text}")
@@ -241,11 +280,12 @@ class Requests:
             raise RunError(f"rollback refused: {text}")
         return text
 
-    def _unload(self, name: str) -> Program:
-        slots = [s for s, c in self.slots.items() if name in (s, c) and s != self.owner]
-        if not slots or slots[0] == "whisk":
-            raise RunError(f"unload: {name!r} is not a controller in shadow that was loaded")
-        accepted, text = yield from self._answer(self._order("forget", "sampler", slots[0]))
+    def _unload(self, name: str, node: str = "whisk") -> Program:
+        kind = self._kind(node)
+        slots = [s for s, c in kind.slots.items() if name in (s, c) and s != kind.owner]
+        if not slots or slots[0] not in kind.places:
+            raise RunError(f"unload: {name!r} is not a {kind.word} in shadow that was loaded")
+        accepted, text = yield from self._answer(self._order("forget", kind.arbiter, slots[0]))
         if not accepted:
             raise RunError(f"unload refused: {text}")
         self._order("close", slots[0], "")
@@ -268,22 +308,22 @@ class Requests:
             raise RunError(f"set {node}.{key} refused: {text}")
         return f"{node}: {text}"
 
-    def _loaded(self, name: str, parameters: str) -> Generator[None, None, str]:
-        """The slot in which a controller answers in shadow, loaded if it was not."""
-        for slot, controller in list(self.slots.items()):
+    def _loaded(self, kind: Kind, name: str, parameters: str) -> Generator[None, None, str]:
+        """The slot in which a controller or SLAM is in shadow, loaded if it was not."""
+        for slot, controller in list(kind.slots.items()):
             if name in (slot, controller) and not parameters:
                 while slot in self._loading:
                     yield
-                if slot not in self.slots:
+                if slot not in kind.slots:
                     raise RunError(f"{name} could not be loaded")
                 return slot
-        if name not in self._installed:
-            self._installed = available(self._run.experiment)
-        if name not in self._installed:
-            known = ", ".join(self._installed)
-            raise RunError(f"unknown controller {name!r}, expected one of {known}")
-        slot = self._free_slot()
-        self.slots[slot] = name
+        if name not in kind.installed:
+            kind.installed = kind.available(self._run.experiment)
+        if name not in kind.installed:
+            known = ", ".join(kind.installed)
+            raise RunError(f"unknown {kind.word} {name!r}, expected one of {known}")
+        slot = kind.free_slot()
+        kind.slots[slot] = name
         self._loading.append(slot)
         try:
             self._order("open", slot, name)
@@ -292,13 +332,11 @@ class Requests:
                 yield
             while not self._run.hand_over_calibration():
                 yield
-            for kind, node, value in (("assign", slot, parameters), ("register", "sampler", "")):
-                other = name if kind == "assign" else slot
-                accepted, text = yield from self._answer(
-                    self._order(kind, node, other, value=value)
-                )
-                if not accepted:
-                    raise RunError(text)
+            yield from self._obeyed(self._order("assign", slot, name, value=parameters))
+            number = self._order("register", kind.arbiter, slot)
+            yield from self._obeyed(number)
+            if kind is self._slams:
+                yield from self._handed_over(number, slot)
         except RunError as error:
             self.failed(slot)
             raise RunError(f"{name} could not be loaded: {error}") from None
@@ -306,13 +344,28 @@ class Requests:
             self._loading.remove(slot)
         return slot
 
-    def _free_slot(self) -> str:
-        used = set(self._used)
-        for slot in SLOTS:
-            if slot not in used:
-                self._used.append(slot)
-                return slot
-        raise RunError(f"no free slot: {len(SLOTS)} controllers were loaded in this run already")
+    def _handed_over(self, number: int, slot: str) -> Generator[None, None, None]:
+        """Until a newcomer has taken what was seen so far, sent again while it does not hear it."""
+        for _ in range(HAND_OVERS):
+            until = self._run.tick + PATIENCE_TICKS
+            while not self._answers.get(number) and self._run.tick < until:
+                yield
+            if self._answers.get(number):
+                return
+            again = self._order("register", self._slams.arbiter, slot)
+            yield from self._obeyed(again)
+            number = again
+        raise RunError("it did not take what was seen so far")
+
+    def _obeyed(self, number: int) -> Generator[None, None, None]:
+        accepted, text = yield from self._answer(number)
+        if not accepted:
+            raise RunError(text)
+
+    def _wait(self, ticks: int) -> Generator[None, None, None]:
+        until = self._run.tick + ticks
+        while self._run.tick < until:
+            yield
 
     def _switched(self, number: int, at: int) -> Generator[None, None, tuple[bool, str]]:
         while self._run.tick < at:

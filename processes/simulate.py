@@ -17,12 +17,13 @@ from vibrissa.processes import provenance
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.framelog import FrameLog
 from vibrissa.processes.group import Group, Steps
+from vibrissa.processes.kinds import scheduled_slots
 from vibrissa.processes.layout import SUPERVISOR_HEARS
 from vibrissa.processes.lockstep import Workers
 from vibrissa.processes.node import Step, Stepper, counters, timer_frame
 from vibrissa.processes.rebuild import make_stepper
 from vibrissa.processes.receipts import ReceiptBook
-from vibrissa.processes.requests import Requests, scheduled_slots
+from vibrissa.processes.requests import Requests
 from vibrissa.processes.results import Executor, OnProgress, Progress, RunError, silent
 from vibrissa.processes.table import PROCESSES, ROWS
 

@@ -1,15 +1,17 @@
-"""The slam process: a tactile image per whisk cycle, odometry, RatSLAM, metrics.
+"""The slam process: a tactile image per whisk cycle, odometry, the run's first SLAM, metrics.
 
 Samples and arm states are kept by tick until a whisk cycle is complete, so what is computed does
 not depend on how messages of different processes interleave.
+
+Other SLAMs may be loaded beside it (`processes.slam_shadow`). They step on the images and odometry
+that are said here, are handed over everything seen so far, and one of them can be made the run's
+SLAM between two whisk cycles. Nothing moves by what a SLAM says, so no arbiter is needed: the first
+one never stops, and takes over again from one that is silent.
 """
 
 from __future__ import annotations
 
 import collections
-import dataclasses
-import math
-from typing import Any
 
 import numpy as np
 
@@ -17,63 +19,36 @@ from vibrissa.control.kinematics import NOSE_HEIGHT, paper_head
 from vibrissa.messages.codec import Message
 from vibrissa.messages.types import (
     TICK_HZ,
+    TICK_NS,
     WHISKERS,
     ArmState,
     HeadSample,
-    Metrics,
-    SlamMap,
-    SlamPose,
-    SlamView,
     WhiskCalibration,
     WhiskCycle,
 )
-from vibrissa.numerics import cos, philox_normal, sin
+from vibrissa.numerics import philox_normal
 from vibrissa.processes.arm import ARM_TICKS
 from vibrissa.processes.config import Experiment
+from vibrissa.processes.mapping import IMAGES, Mapping, Sight
 from vibrissa.processes.node import Output
-from vibrissa.processes.results import RunError
+from vibrissa.processes.slam_others import Others
+from vibrissa.processes.slams import make_slam
 from vibrissa.slam import tactile
-from vibrissa.slam.angles import wrap_pi
-from vibrissa.slam.config import PRESETS, ConfigError, RatSlamConfig
-from vibrissa.slam.interface import Odometry, Slam, SlamStep
-from vibrissa.slam.metrics import energy_metric, experience_metric, first_circuit, fixed_interval
 from vibrissa.slam.odometry import NOISE_MODELS, odometry_between
-from vibrissa.slam.ratslam import RatSlam
 
 NOISE_STREAM = 1000
 """Noise stream of the odometry; the head's sensors use streams below."""
 WORKING = 0.001
 """How near the nose plane must be to its working height for a cycle to count, m."""
-REPORT_CYCLES = 10
-
-
-def make_slam_config(experiment: Experiment) -> RatSlamConfig:
-    """The RatSLAM parameters of an experiment. Raises RunError that names the bad one."""
-    settings = experiment.slam
-    if settings.preset not in PRESETS:
-        raise RunError(f"slam.preset: {settings.preset!r}, expected one of {', '.join(PRESETS)}")
-    if settings.odometry_noise not in NOISE_MODELS:
-        raise RunError(
-            f"slam.odometry_noise: {settings.odometry_noise!r}, "
-            f"expected one of {', '.join(NOISE_MODELS)}"
-        )
-    known = {f.name for f in dataclasses.fields(RatSlamConfig)}
-    for name in settings.parameters:
-        if name not in known:
-            raise RunError(f"slam.parameters.{name}: no such RatSLAM parameter")
-    try:
-        changes: dict[str, Any] = dict(settings.parameters)
-        return dataclasses.replace(PRESETS[settings.preset], **changes)
-    except ConfigError as error:
-        raise RunError(f"slam.parameters.{error}") from None
 
 
 class SlamNode:
     """Builds the tactile image of every cycle and steps a SLAM with it."""
 
     def __init__(self, experiment: Experiment) -> None:
-        self._slam: Slam = RatSlam(make_slam_config(experiment))
-        self._kind = experiment.slam.image
+        slam = make_slam(experiment.slam.algorithm, experiment)
+        self._mapping = Mapping(slam, experiment.slam.image)
+        self._others = Others(experiment.slam.image, experiment.period_ticks)
         self._noise = NOISE_MODELS[experiment.slam.odometry_noise]
         self._seed = experiment.run.seed
         size = 2 * experiment.period_ticks + TICK_HZ
@@ -85,9 +60,6 @@ class SlamNode:
         self._imager: tactile.TactileImager | None = None
         self._free_angle = np.zeros(WHISKERS)
         self._last: ArmState | None = None
-        self._cycle = 0
-        self._reported = 0
-        self._log = TrajectoryLog()
 
     def step(self, message: Message) -> list[Output]:
         body = message.body
@@ -102,13 +74,20 @@ class SlamNode:
                 self._cycles.append(body)
             case "whisk.calibration":
                 self._calibration = body
+            case "slam.pose":
+                self._others.heard(message.source, body.cycle)
+                return []
+            case "run.order" if body.node == "slam":
+                return self._others.obey(body, message.t // TICK_NS)
+            case "run.order":
+                return []
             case "run.event" if body.kind == "stop":
-                return self._complete_cycles() + self._report()
+                return self._complete_cycles() + self._mapping.report()
         return self._complete_cycles()
 
     def counters(self) -> dict[str, int]:
         """Cycles that became a view."""
-        return {"views": len(self._log.experiences)}
+        return {"views": self._mapping.views}
 
     def _keep(self, sample: HeadSample) -> None:
         slot = sample.tick % self._samples.shape[1]
@@ -147,59 +126,16 @@ class SlamNode:
         return self._see(cycle, before, here)
 
     def _see(self, cycle: WhiskCycle, before: ArmState, here: ArmState) -> list[Output]:
-        images = self._make_imager().image(*self._of_cycle(cycle))
-        image = getattr(images, self._kind)
+        found = self._make_imager().image(*self._of_cycle(cycle))
+        images = {kind: getattr(found, kind).reshape(-1) for kind in IMAGES}
         dt = (here.tick - before.tick) / TICK_HZ
         exact = odometry_between(_planar(before), _planar(here), dt)
         normals = (
             philox_normal(self._seed, NOISE_STREAM, 2 * cycle.cycle),
             philox_normal(self._seed, NOISE_STREAM, 2 * cycle.cycle + 1),
         )
-        odometry = self._noise.apply(exact, normals)
-        result = self._slam.step(image, odometry)
-        self._cycle = cycle.cycle
-        self._log.add(result, odometry, _planar(here))
-        error = result.match_error if math.isfinite(result.match_error) else -1.0
-        outputs: list[Output] = [
-            (
-                "slam.view",
-                SlamView(
-                    cycle=cycle.cycle,
-                    max_angle_gated=images.max_angle_gated.reshape(-1),
-                    max_angle_ungated=images.max_angle_ungated.reshape(-1),
-                    contact_angle=images.contact_angle.reshape(-1),
-                    template=result.template,
-                    new=int(result.new_template),
-                    error=error,
-                ),
-            ),
-            (
-                "slam.pose",
-                SlamPose(
-                    cycle=cycle.cycle,
-                    experience=result.experience,
-                    action=result.action,
-                    estimate=np.array([result.x, result.y, result.heading]),
-                    odometry=np.array([odometry.v, odometry.w, odometry.dt]),
-                    truth=here.pose.copy(),
-                ),
-            ),
-        ]
-        views = len(self._log.experiences)
-        if views - self._reported >= max(REPORT_CYCLES, views // 10):
-            outputs += self._report()
-        return outputs
-
-    def _report(self) -> list[Output]:
-        """Map and metrics: at ever longer intervals, so that their cost stays in proportion."""
-        if self._reported == len(self._log.experiences):
-            return []
-        self._reported = len(self._log.experiences)
-        found = self._slam.map()
-        return [
-            ("slam.map", SlamMap(self._cycle, found.poses, found.links.astype(np.int32))),
-            ("eval.metrics", self._log.metrics(self._cycle)),
-        ]
+        sight = Sight(cycle.cycle, images, self._noise.apply(exact, normals), here.pose)
+        return self._mapping.see(sight) + self._others.saw(sight)
 
     def _make_imager(self) -> tactile.TactileImager:
         if self._imager is None:
@@ -225,50 +161,6 @@ class SlamNode:
         ticks = np.arange(cycle.first_tick, cycle.last_tick + 1) % self._samples.shape[1]
         theta, x, y = self._samples[:, ticks]
         return theta, x, y
-
-
-class TrajectoryLog:
-    """True, estimated and dead-reckoned trajectories, one pose per cycle, and their metrics."""
-
-    def __init__(self) -> None:
-        self.experiences: list[int] = []
-        self.templates = 0
-        self._known = 0
-        self._truth: list[tuple[float, float, float]] = []
-        self._estimate: list[tuple[float, float, float]] = []
-        self._reckoned: list[tuple[float, float, float]] = []
-
-    def add(self, result: SlamStep, odometry: Odometry, truth: tuple[float, float, float]) -> None:
-        x, y, heading = self._reckoned[-1] if self._reckoned else (0.0, 0.0, 0.0)
-        heading = wrap_pi(heading + odometry.w * odometry.dt)
-        distance = odometry.v * odometry.dt
-        self._reckoned.append((x + distance * cos(heading), y + distance * sin(heading), heading))
-        self._estimate.append((result.x, result.y, result.heading))
-        self._truth.append(truth)
-        self.experiences.append(result.experience)
-        self.templates = result.templates
-        self._known = result.experiences
-
-    def metrics(self, cycle: int) -> Metrics:
-        """Scores so far, over consecutive relations, beside those of the raw odometry."""
-        base = first_circuit(self._truth)
-        score = experience_metric(self.experiences, self._truth, base)
-        pairs = fixed_interval(len(self._truth))
-        estimated = reckoned = None
-        if len(pairs):
-            estimated = energy_metric(self._estimate, self._truth, pairs)
-            reckoned = energy_metric(self._reckoned, self._truth, pairs)
-        return Metrics(
-            cycle=cycle,
-            arr=-1.0 if score.arr is None else score.arr,
-            arcr=-1.0 if score.arcr is None else score.arcr,
-            em_translation=estimated.translation if estimated else -1.0,
-            em_rotation=estimated.rotation if estimated else -1.0,
-            odometry_translation=reckoned.translation if reckoned else -1.0,
-            odometry_rotation=reckoned.rotation if reckoned else -1.0,
-            experiences=self._known,
-            templates=self.templates,
-        )
 
 
 def _working(state: ArmState) -> bool:

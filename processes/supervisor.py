@@ -35,11 +35,12 @@ from vibrissa.processes import provenance
 from vibrissa.processes.config import RETRACT_S, Experiment
 from vibrissa.processes.control import ControlDesk
 from vibrissa.processes.gate import Gate
+from vibrissa.processes.kinds import scheduled_slots
 from vibrissa.processes.layout import Layout
 from vibrissa.processes.registry import listed
-from vibrissa.processes.requests import Requests, scheduled_slots
+from vibrissa.processes.requests import Requests
 from vibrissa.processes.results import OnProgress, Progress, RunError, one_line, silent
-from vibrissa.processes.table import PROCESSES, RECORDER_SILENCE, ROWS, SLOTS
+from vibrissa.processes.table import ALL_SLOTS, PROCESSES, RECORDER_SILENCE, ROWS, SLOTS
 
 LEAD_S: Final = 0.25
 """From the go to tick 0."""
@@ -198,7 +199,7 @@ class Supervisor:
             hosts.setdefault(together.get(name, name), [])
         for host in hosts:
             hosts[host] = host.split("+")
-        names = ["control", "supervisor", "recorder", *hosts, *SLOTS]
+        names = ["control", "supervisor", "recorder", *hosts, *ALL_SLOTS]
         if run.transport == "tcp":
             endpoints = {n: f"tcp://127.0.0.1:{run.tcp_port + i}" for i, n in enumerate(names)}
             for name, endpoint in endpoints.items():
@@ -257,8 +258,8 @@ class Supervisor:
         self._cpu0 = time.process_time()
         for child in self.children.values():
             child.heard = time.monotonic()
-            if child.name in SLOTS:
-                child.silence = SLOTS[child.name].silence
+            if child.name in ALL_SLOTS:
+                child.silence = ALL_SLOTS[child.name].silence
             if child.name != "recorder":
                 self.desk.say(child.name, "go", t0_ns=self.t0)
         missing = sorted({m for c in self.children.values() for m in c.missing})
@@ -278,7 +279,7 @@ class Supervisor:
             now = time.monotonic()
             self.requests.poll()
             for child in list(self.children.values()):
-                if child.name in SLOTS and child.bye and not child.last_words:
+                if child.name in ALL_SLOTS and child.bye and not child.last_words:
                     self._part(child)
                 elif trouble := child.trouble(now, self.tick * TICK_NS):
                     self._listen()  # its last words
@@ -351,8 +352,8 @@ class Supervisor:
             raise RunError(self.lost[slot].last_words)
         if not child.ready:
             return False
-        if child.silence != SLOTS[slot].silence:
-            child.silence = SLOTS[slot].silence
+        if child.silence != ALL_SLOTS[slot].silence:
+            child.silence = ALL_SLOTS[slot].silence
             child.heard = time.monotonic()
             self.desk.say(slot, "go", t0_ns=self.t0)
         return True
@@ -367,7 +368,9 @@ class Supervisor:
     def _expendable(self, name: str) -> bool:
         """Whether the run goes on without this process: it hosts one controller of several."""
         others = self.requests.slots.keys() - {name}
-        return name in SLOTS or (name == "whisk" and self._calibration is not None and bool(others))
+        return name in ALL_SLOTS or (
+            name == "whisk" and self._calibration is not None and bool(others)
+        )
 
     def _lose(self, child: Child, why: str) -> None:
         """A controller is lost; the arbiter falls back if it had the drives; the run goes on."""
@@ -438,6 +441,8 @@ class Supervisor:
             if message.topic == "node.event":
                 event: Event = message.body
                 self._note(event.tick, event.kind, event.node, event.cause)
+                if event.kind == "failed":
+                    self.requests.failed(message.source)
                 if event.kind in FATAL:
                     self.cause = self.cause or f"{event.node}: {event.cause}"
 
@@ -474,7 +479,7 @@ class Supervisor:
         self._refused[source] += count
         if self._refused[source] == count:  # the first time
             self._note(self.tick, "refused", name, f"{count} frames of {source}: {cause}")
-        if self._refused[source] > FLOOD and source in SLOTS and source in self.children:
+        if self._refused[source] > FLOOD and source in ALL_SLOTS and source in self.children:
             self._lose(self.children[source], f"{source} flooded {name}: {cause}")
 
     def _answer_client(self, name: str, verb: str, arguments: dict[str, Any]) -> None:

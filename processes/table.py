@@ -96,16 +96,33 @@ PROCESSES: Final[dict[str, Process]] = {
         Process(
             "arm",
             "vibrissa.processes.arm:ArmNode",
-            hears=("rig.arm", "whisk.calibration", "run.event", "host.event"),
-            says=("arm.state", "arm.setpoint", "node.event"),
+            hears=("rig.arm", "whisk.calibration", "run.order", "run.event", "host.event"),
+            says=("arm.state", "arm.setpoint", "node.answer", "node.event"),
             pacing="arrival",
             priority=40,
         ),
         Process(
             "slam",
             "vibrissa.processes.slam:SlamNode",
-            hears=("head.sample", "whisk.cycle", "whisk.calibration", "arm.state", "run.event"),
-            says=("slam.view", "slam.pose", "slam.map", "eval.metrics", "node.event"),
+            hears=(
+                "head.sample",
+                "whisk.cycle",
+                "whisk.calibration",
+                "arm.state",
+                "slam.pose",
+                "run.order",
+                "run.event",
+            ),
+            says=(
+                "slam.view",
+                "slam.pose",
+                "slam.map",
+                "slam.owner",
+                "slam.history",
+                "eval.metrics",
+                "node.answer",
+                "node.event",
+            ),
             pacing="drain",
             priority=0,
             silence=5.0,
@@ -121,7 +138,22 @@ SLOTS: Final[dict[str, Process]] = {
 to the first one. Everybody who listens to controllers listens here from the start, so that a
 newcomer needs nothing from the 2 kHz loop."""
 
-ROWS: Final = PROCESSES | SLOTS
+SLAM_SLOTS: Final[dict[str, Process]] = {
+    name: Process(
+        name,
+        "vibrissa.processes.slam_shadow:SlamShadowNode",
+        hears=("slam.view", "slam.pose", "slam.history", "run.order", "run.event"),
+        says=("slam.view", "slam.pose", "slam.map", "eval.metrics", "node.answer", "node.event"),
+        pacing="drain",
+        priority=0,
+        silence=5.0,
+    )
+    for name in (f"slam.{number}" for number in range(1, 4))
+}
+"""Empty places for SLAMs beside the first one."""
+
+ALL_SLOTS: Final = SLOTS | SLAM_SLOTS
+ROWS: Final = PROCESSES | ALL_SLOTS
 
 RECORDER_PRIORITY: Final = 20
 """Above ordinary work, which would starve it on a busy machine."""
@@ -136,7 +168,7 @@ def build(name: str, experiment: Experiment) -> Node:
     """A fresh node of the table in its initial state, made from the experiment alone."""
     module, _, attribute = ROWS[name].node.partition(":")
     make = getattr(importlib.import_module(module), attribute)
-    node: Node = make(experiment, name) if name in SLOTS else make(experiment)
+    node: Node = make(experiment, name) if name in ALL_SLOTS else make(experiment)
     return node
 
 

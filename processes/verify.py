@@ -8,28 +8,24 @@ identical by induction. The log is read as a stream: memory does not grow with i
 
 from __future__ import annotations
 
-import collections
 import contextlib
-import dataclasses
 import gc
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final
-
-import numpy as np
+from typing import Final
 
 from vibrissa.messages.codec import decode, epoch_of, header
 from vibrissa.messages.errors import MessageError
 from vibrissa.messages.log_format import LogError, Record
 from vibrissa.messages.log_reader import LogReader
 from vibrissa.messages.topics import TOPICS
-from vibrissa.messages.types import Order
-from vibrissa.processes import provenance
+from vibrissa.messages.types import TICK_NS, Event, Order
+from vibrissa.processes import controllers, provenance, slams
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.framelog import frame_of
-from vibrissa.processes.lockstep import LocalRunner, RemoteRunner, Result, Workers
-from vibrissa.processes.node import timer_frame
+from vibrissa.processes.lockstep import LocalRunner, RemoteRunner, Workers
+from vibrissa.processes.node_check import NodeCheck, first_cause
 from vibrissa.processes.rebuild import (
     Replacements,
     check_replacements,
@@ -37,9 +33,7 @@ from vibrissa.processes.rebuild import (
     make_stepper,
     open_log,
 )
-from vibrissa.processes.receipts import Entry, Stream, entries
 from vibrissa.processes.results import (
-    Difference,
     Executor,
     OnProgress,
     Progress,
@@ -47,178 +41,12 @@ from vibrissa.processes.results import (
     Verdict,
     silent,
 )
-from vibrissa.processes.table import PROCESSES, ROWS, SLOTS
+from vibrissa.processes.table import ALL_SLOTS, PROCESSES, ROWS, SLAM_SLOTS
 
 PUMP_RECORDS: Final = 4000
 AFTERMATH_NS: Final = 500_000_000
-"""How far to read on after a difference, so that its cause is found before its consequences."""
-
-
-@dataclasses.dataclass(slots=True)
-class Finding:
-    """A difference, the message that differs and the message whose consumption showed it."""
-
-    difference: Difference
-    t: int
-    output: tuple[Stream, int] | None
-    consumed: tuple[Stream, int]
-
-
-class NodeCheck:
-    """The re-run of one node against its receipts and recorded outputs."""
-
-    def __init__(self, runner: LocalRunner | RemoteRunner) -> None:
-        self.name = runner.name
-        self._runner = runner
-        self._entries: collections.deque[Entry] = collections.deque()
-        self._inbox: dict[Stream, dict[int, bytes]] = collections.defaultdict(dict)
-        self._expected: dict[str, collections.deque[bytes]] = collections.defaultdict(
-            collections.deque
-        )
-        self._batch: list[Entry] = []
-        self._frames: list[bytes] = []
-        self._next_step = 0
-        self._decided = -1
-        self.steps = 0
-        self.messages = 0
-        self.bytes = 0
-        self.finding: Finding | None = None
-
-    def add_receipts(self, frame: bytes) -> None:
-        """Raises UnusableLogError when receipts are missing or contradict themselves."""
-        try:
-            found = list(entries(decode(frame)))
-        except ValueError as error:
-            raise UnusableLogError(f"a receipt of {self.name} can't be read: {error}") from None
-        if found and found[0].step != self._next_step:
-            raise UnusableLogError(
-                f"receipts of {self.name} are missing: expected step {self._next_step}, "
-                f"found {found[0].step}"
-            )
-        self._next_step += len(found)
-        if self.finding is None:
-            self._entries.extend(found)
-
-    def add_input(self, stream: Stream, seq: int, frame: bytes) -> None:
-        if self.finding is None:
-            self._inbox[stream][seq] = frame
-
-    def add_output(self, topic: str, frame: bytes) -> None:
-        if self.finding is None:
-            self._expected[topic].append(frame)
-
-    def submit(self) -> None:
-        """Hand every step whose input is there to the runner."""
-        while self._entries and self.finding is None:
-            entry = self._entries[0]
-            topic, source, epoch = entry.stream
-            if topic == "host.timer" and source == self.name and epoch == 0:
-                frame = timer_frame(self.name, entry.seq)
-            else:
-                found = self._inbox[entry.stream].pop(entry.seq, None)
-                if found is None:
-                    break
-                frame = found
-            if topic == "run.event":
-                self._decided = entry.seq
-            self._batch.append(self._entries.popleft())
-            self._frames.append(frame)
-        self._runner.submit(self._frames)
-
-    def collect(self) -> None:
-        """Compare what came out with what was recorded."""
-        results = self._runner.collect()
-        for entry, frame, result in zip(self._batch, self._frames, results, strict=True):
-            self.finding = self._compare(entry, frame, result)
-            if self.finding is not None:
-                break
-            self.steps += 1
-        self._batch.clear()
-        self._frames = []
-
-    def leftovers(self, last_decision: int) -> str | None:
-        """What a complete log should not leave: a receipt without its message, or the reverse."""
-        if self.finding is not None:
-            return None
-        if self._entries:
-            entry = self._entries[0]
-            topic, source, epoch = entry.stream
-            return (
-                f"{self.name}, step {entry.step}: consumed {topic} #{entry.seq} of {source} "
-                f"(epoch {epoch}), which is not in the log"
-            )
-        for topic, frames in self._expected.items():
-            if frames:
-                seq = header(frames[0])[3]
-                return f"{self.name}: no receipt accounts for its {topic} #{seq}"
-        if self.name in PROCESSES and self._decided < last_decision:
-            return (
-                f"{self.name}: its receipts end at step {self._next_step}, before it consumed "
-                f"run.event #{last_decision}"
-            )
-        return None
-
-    def _compare(self, entry: Entry, frame: bytes, result: Result) -> Finding | None:
-        digest, outputs, error = result
-        if error:
-            return self._broken(entry, frame, "step", f"digest {entry.digest:08x}", error)
-        for output in outputs:
-            topic = output[: output.find(b"\0")].decode()
-            if not TOPICS[topic].recorded:
-                continue
-            expected = self._expected[topic]
-            recorded = expected.popleft() if expected else None
-            if recorded != output:
-                field, then, now = differing_field(recorded, output)
-                _, source, epoch, seq, t = header(output)
-                difference = Difference(self.name, entry.step, topic, field, then, now, t * 1e-9)
-                altered = ((topic, source, epoch), seq)
-                return Finding(difference, t, altered, (entry.stream, entry.seq))
-            self.messages += 1
-            self.bytes += len(output)
-        if digest != entry.digest:
-            now = f"digest {digest:08x} (the order of receipts or an input was altered)"
-            return self._broken(entry, frame, "receipt", f"digest {entry.digest:08x}", now)
-        return None
-
-    def _broken(self, entry: Entry, frame: bytes, field: str, then: str, now: str) -> Finding:
-        """A step that went otherwise than its receipt says, whatever was said in it."""
-        t = header(frame)[4]
-        topic = entry.stream[0]
-        difference = Difference(self.name, entry.step, topic, field, then, now, t * 1e-9)
-        return Finding(difference, t, None, (entry.stream, entry.seq))
-
-
-def differing_field(recorded: bytes | None, recomputed: bytes) -> tuple[str, str, str]:
-    """(field, recorded value, recomputed value) of the first field that differs."""
-    now = decode(recomputed)
-    if recorded is None:
-        return "message", "no message", f"#{now.seq}"
-    try:
-        then = decode(recorded)
-    except MessageError as error:
-        return "message", f"unreadable ({error})", f"#{now.seq}"
-    for name in ("source", "epoch", "seq", "t"):
-        if getattr(then, name) != getattr(now, name):
-            return name, str(getattr(then, name)), str(getattr(now, name))
-    for field in dataclasses.fields(now.body):
-        a, b = getattr(then.body, field.name), getattr(now.body, field.name)
-        if isinstance(b, np.ndarray):
-            if a.tobytes() != b.tobytes():
-                return _differing_element(field.name, a, b)
-        elif repr(a) != repr(b):
-            return field.name, repr(a), repr(b)
-    return "encoding", f"{len(recorded)} bytes", f"{len(recomputed)} bytes"
-
-
-def _differing_element(name: str, a: Any, b: Any) -> tuple[str, str, str]:
-    if a.shape != b.shape:
-        return name, f"shape {a.shape}", f"shape {b.shape}"
-    width = a.dtype.itemsize
-    one = np.frombuffer(a.tobytes(), np.uint8).reshape(-1, width)
-    two = np.frombuffer(b.tobytes(), np.uint8).reshape(-1, width)
-    index = int(np.flatnonzero((one != two).any(axis=1))[0])
-    return f"{name}[{index}]", repr(a.reshape(-1)[index].item()), repr(b.reshape(-1)[index].item())
+"""How far to read on after a difference, so that its cause is found before its consequences, and
+after the loss of a process, so that what it said last has been read."""
 
 
 def verify(
@@ -240,7 +68,7 @@ def verify(
     names = reader.metadata.get("nodes", ",".join(PROCESSES)).split(",")
     notes = provenance.mismatches(reader.metadata)
     with _runners(executor, experiment, replacements) as start, _no_collections():
-        checks = Checks(start, names)
+        checks = Checks(start, names, experiment, path)
         return _verify(reader, experiment, executor, checks, notes, on_progress)
 
 
@@ -287,12 +115,14 @@ def _verify(
             t = max(t, record.t)
             if count % PUMP_RECORDS == 0:
                 checks.pump()
+                checks.settle(t - AFTERMATH_NS)
                 on_progress(Progress(f"{executor} re-run", t * 1e-9, experiment.run.duration))
                 if stop_at is None and any(c.finding for c in checks.all):
                     stop_at = t + AFTERMATH_NS
                 if stop_at is not None and t > stop_at:
                     break
         checks.pump()
+        checks.settle(t)
     except LogError as error:
         raise UnusableLogError(str(error)) from None
     except MessageError as error:
@@ -311,6 +141,7 @@ def _verify(
             why = f"{died} died during the run" if died else "the log is cut off"
             ends = ", ".join(f"{c.name} {c.steps}" for c in checks.all)
             notes.append(f"{why}; verified to the last complete steps: {ends}")
+        notes += checks.recalled
     return Verdict(
         identical=first is None,
         executor=executor,
@@ -324,18 +155,18 @@ def _verify(
     )
 
 
-def first_cause(findings: Sequence[Finding]) -> Difference | None:
-    """The earliest difference that is not merely the consequence of consuming another one."""
-    altered = {f.output for f in findings if f.output is not None}
-    roots = [f for f in findings if f.consumed not in altered] or list(findings)
-    return min(roots, key=lambda f: f.t).difference if roots else None
-
-
 class Checks:
     """The checks of all nodes; every record goes to those that said or heard it."""
 
-    def __init__(self, start: Start, names: Sequence[str]) -> None:
+    def __init__(
+        self, start: Start, names: Sequence[str], experiment: Experiment, path: Path
+    ) -> None:
         self._start = start
+        self._path = path
+        self._installed = controllers.available(experiment) | slams.available(experiment)
+        self._lost: dict[str, int] = {}
+        self.recalled: list[str] = []
+        """What was computed that is not in the log, one line per process that was killed."""
         self._by_name: dict[str, NodeCheck] = {}
         self._hearers: dict[str, list[NodeCheck]] = {topic: [] for topic in TOPICS}
         self.last_decision = -1
@@ -359,7 +190,7 @@ class Checks:
         if topic == "run.order":
             self._open_slot(frame)
         elif topic == "run.event":
-            self.last_decision = seq
+            self._decided(frame, seq)
         if producer is not None and row.compared:
             producer.add_output(topic, frame)
         hearers = self._hearers[topic]
@@ -376,10 +207,52 @@ class Checks:
         for check in self._by_name.values():
             check.collect()
 
+    def settle(self, t: int) -> None:
+        """Recall the last words of processes that were killed up to `t` ns."""
+        for name, killed in list(self._lost.items()):
+            if killed <= t:
+                del self._lost[name]
+                self._recall(self._by_name[name])
+
+    def _recall(self, check: NodeCheck) -> None:
+        """Re-compute what a killed process said, as far as it was recorded or anybody heard it.
+
+        The digests of those who heard it tell whether it is what they heard.
+        """
+        ticks: list[int] = []
+        steps = check.recall()
+        while check.unaccounted() or any(c.waits_for() == check.name for c in self.all):
+            outputs = next(steps, None)
+            if outputs is None:
+                break
+            for output in outputs:
+                topic, source, epoch, seq, t = header(output)
+                ticks.append(t // TICK_NS)
+                for hearer in self._hearers[topic]:
+                    hearer.add_input((topic, source, epoch), seq, output)
+            self.pump()
+        check.end()
+        if ticks:
+            self.recalled.append(
+                f"{check.name} was killed; what it said in ticks {ticks[0]} to {ticks[-1]} is not "
+                "in the log and was computed again from what it heard"
+            )
+
+    def _decided(self, frame: bytes, seq: int) -> None:
+        event: Event = decode(frame).body
+        self.last_decision = seq
+        if event.kind == "lost" and event.node in self._by_name:
+            self._lost[event.node] = event.tick * TICK_NS
+
     def _open_slot(self, frame: bytes) -> None:
         """A controller was loaded into a slot: from here on the slot's node is re-run, too."""
         order: Order = decode(frame).body
-        if order.kind == "open" and order.node in SLOTS and order.node not in self._by_name:
+        if order.kind == "open" and order.name not in self._installed:
+            raise UnusableLogError(
+                f"{self._path}: {_word(order.node)} {order.name} is not installed and the run "
+                f"loaded it into {order.node}; installed are {', '.join(self._installed)}"
+            )
+        if order.kind == "open" and order.node in ALL_SLOTS and order.node not in self._by_name:
             self._add([order.node])
 
     def _add(self, names: Sequence[str]) -> None:
@@ -388,3 +261,7 @@ class Checks:
             for topic in ROWS[runner.name].hears:
                 if topic in self._hearers:
                     self._hearers[topic].append(check)
+
+
+def _word(slot: str) -> str:
+    return "slam" if slot in SLAM_SLOTS else "controller"

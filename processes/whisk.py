@@ -9,10 +9,15 @@ from typing import Any, Final
 
 import numpy as np
 
-from vibrissa.control.calibration import Calibration, CalibrationError, Calibrator
+from vibrissa.control.calibration import (
+    Calibration,
+    CalibrationError,
+    Calibrator,
+    inertial_moment,
+)
 from vibrissa.control.controller import Controller
 from vibrissa.control.drives import Violation, check_command
-from vibrissa.control.kinematics import Float32s
+from vibrissa.control.kinematics import Float32s, paper_head
 from vibrissa.messages.codec import Message
 from vibrissa.messages.types import (
     TICK_NS,
@@ -163,7 +168,8 @@ class WhiskNode:
         return f"{order.name} = {order.value}"
 
     def _fresh_calibrator(self) -> Calibrator:
-        return Calibrator(self._calibration_cycles, self._period)
+        inertial = inertial_moment(paper_head(), self._period)
+        return Calibrator(self._calibration_cycles, self._period, inertial=inertial)
 
     def _calibrate(self, calibrator: Calibrator, sample: HeadSample) -> list[Output]:
         if self._disturbed:

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -16,8 +18,13 @@ import numpy as np
 from vibrissa.control.kinematics import Float32s
 from vibrissa.control.open_loop import OpenLoop
 from vibrissa.control.whisk_pattern import WhiskParams
+from vibrissa.messages.codec import CODECS, Message
+from vibrissa.messages.types import TICK_NS, WhiskCommand
+from vibrissa.processes.host import Host
+from vibrissa.processes.whisk import WhiskNode
 
-SHADOW_TICKS = 1000
+SHADOW_TICKS = 2000
+"""More than a rehearsal has."""
 ACTIVE_TICKS = 100
 
 
@@ -121,6 +128,66 @@ class Stopped(Faulty):
     def fault(self, command: Float32s) -> Any:
         os.kill(os.getpid(), signal.SIGSTOP)
         return command
+
+
+def caller(kind: type) -> Any:
+    """The nearest object of a class whose method is running; None when there is none.
+
+    What a controller must not do: reach for the process around it. A re-run has no live host.
+    """
+    frame = sys._getframe()
+    while frame is not None:
+        if isinstance(found := frame.f_locals.get("self"), kind):
+            return found
+        frame = frame.f_back
+    return None
+
+
+class SaysStaleTicks(Faulty):
+    """Answers the sample of five ticks ago from some moment on."""
+
+    _stale = False
+
+    def fault(self, command: Float32s) -> Any:
+        if not self._stale:
+            self._stale = True
+            node = caller(WhiskNode)
+            fresh = node.step
+
+            def step(message: Message) -> Iterator[tuple[str, Any]]:
+                for topic, body in fresh(message):
+                    late = topic == "whisk.command"
+                    yield topic, WhiskCommand(body.tick - 5, body.command) if late else body
+
+            node.step = step
+        return command
+
+
+class Forger(Faulty):
+    """Sends commands in the name of the run's first controller beside its own."""
+
+    copies, source = 1, "whisk"
+
+    def step(self, tick: int, theta: Float32s, x: Float32s, y: Float32s) -> Float32s:
+        self._tick = tick
+        return super().step(tick, theta, x, y)
+
+    def fault(self, command: Float32s) -> Any:
+        host = caller(Host)
+        if host is not None:
+            source = self.source or host.name
+            body = WhiskCommand(self._tick, np.zeros(18, np.float32))
+            forged = CODECS["whisk.command"].encode(source, 0, 10**6, self._tick * TICK_NS, body)
+            for _ in range(self.copies):
+                host.port.publish(forged)
+        return command
+
+
+class Floods(Forger):
+    """Fills everybody's sockets while it is in shadow."""
+
+    when, after = 1, SHADOW_TICKS
+    copies, source = 2000, ""
 
 
 class KilledInShadow(Killed):

@@ -17,10 +17,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mpmath import mp, mpf
+from numba.core.caching import IndexDataCacheFile
 from scipy import stats
 
 import vibrissa
 from vibrissa import elementary
+from vibrissa.compilation import CacheFile
 from vibrissa.numerics import (
     MAX_ANGLE,
     acos,
@@ -460,6 +462,37 @@ def test_compiled_code_on_disk_follows_the_sources_it_was_made_from(tmp_path):
     assert run() == ["1.0", "1.0", "1"]
     (package / "deep.py").write_text("CONSTANT = 2.0\n")
     assert run() == ["2.0", "1.0", "0"]  # numba alone goes on with what it has
+
+
+def test_processes_that_compile_at_once_never_load_each_others_code(tmp_path):
+    old, new, late = (CacheFile(str(tmp_path), "kernel", stamp) for stamp in ("old", "new", "new"))
+    old.save(("f32",), "old code")
+    assert old.load(("f32",)) == "old code"
+    assert new.load(("f32",)) is None
+    # a second process looks into the index before the first has written to it, and writes after it
+    seen = late._load_index()
+    late._load_index = lambda: seen
+    new.save(("f32",), "code for f32")
+    late.save(("f64",), "code for f64")
+    del late._load_index
+    for key in (("f32",), ("f64",)):
+        assert new.load(key) in (f"code for {key[0]}", None)
+    assert late.load(("f64",)) == "code for f64"
+
+
+def test_an_index_never_points_to_code_that_is_not_written_yet(tmp_path, monkeypatch):
+    CacheFile(str(tmp_path), "kernel", "old").save(("f32",), "old code")
+    file = CacheFile(str(tmp_path), "kernel", "new")
+    seen = []
+
+    def look(name, data):
+        seen.append(CacheFile(str(tmp_path), "kernel", "new").load(("f32",)))
+        IndexDataCacheFile._save_data(file, name, data)
+        seen.append(CacheFile(str(tmp_path), "kernel", "new").load(("f32",)))
+
+    monkeypatch.setattr(file, "_save_data", look)
+    file.save(("f32",), "new code")
+    assert seen == [None, None] and file.load(("f32",)) == "new code"
 
 
 @pytest.mark.parametrize(

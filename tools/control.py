@@ -22,6 +22,10 @@ Params = Annotated[
     list[str] | None,
     typer.Option("--param", metavar="KEY=VALUE", help="Parameter of the controller; repeatable."),
 ]
+Of = Annotated[
+    str,
+    typer.Option("--node", help="Whose: whisk (a controller), slam, or for swap arm (circuits)."),
+]
 REFUSED = 1
 """Exit code of a request that the run refused; nothing has changed then."""
 
@@ -61,14 +65,21 @@ def controllers(run: Run = None, as_json: Json = False) -> None:
     stdout().print(loaded)
 
 
-def load(name: Name, param: Params = None, run: Run = None, as_json: Json = False) -> None:
+def load(
+    name: Name,
+    param: Params = None,
+    node: Of = "whisk",
+    run: Run = None,
+    as_json: Json = False,
+) -> None:
     """Have a controller answer in shadow: on the same live data, recorded, not routed.
 
+    With --node slam, a SLAM, which is handed over everything seen so far.
     With --param a new instance is loaded, whatever is loaded already. Exit code 1 when the run
     refuses, 2 when there is no such run.
     """
     parameters = _parameters(param)
-    _ask(run, as_json, lambda client: client.load(name, **parameters))
+    _ask(run, as_json, lambda client: client.load(name, node=node, **parameters))
 
 
 def swap(
@@ -79,17 +90,21 @@ def swap(
     ] = False,
     blend: Annotated[float, typer.Option(help="s to go from the old commands to the new.")] = 0.0,
     param: Params = None,
+    node: Of = "whisk",
     run: Run = None,
     as_json: Json = False,
 ) -> None:
     """Give the drives to a controller, loading it first if it is not in shadow yet.
+
+    With --node slam, make another SLAM the run's from the next whisk cycle on. With --node arm,
+    NAME is the circuits (letters C and A) in place of those that have not begun.
 
     The one before stays in shadow for `vibrissa rollback`. Exit code 1 when the run refuses: the
     newcomer is not on time, too far from the last command, another swap is under way, ...
     """
     parameters = _parameters(param)
     when = "cycle" if at_cycle else "now"
-    _ask(run, as_json, lambda client: client.swap(name, when, blend, **parameters))
+    _ask(run, as_json, lambda client: client.swap(name, when, blend, node=node, **parameters))
 
 
 def rollback(run: Run = None, as_json: Json = False) -> None:
@@ -97,9 +112,9 @@ def rollback(run: Run = None, as_json: Json = False) -> None:
     _ask(run, as_json, lambda client: client.rollback())
 
 
-def unload(name: Name, run: Run = None, as_json: Json = False) -> None:
+def unload(name: Name, node: Of = "whisk", run: Run = None, as_json: Json = False) -> None:
     """End a controller that is in shadow. The run's first controller stays."""
-    _ask(run, as_json, lambda client: client.unload(name))
+    _ask(run, as_json, lambda client: client.unload(name, node=node))
 
 
 def set_(

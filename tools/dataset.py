@@ -66,7 +66,7 @@ def load(log: Path) -> Dataset:
     poses: dict[int, tuple[float, Any]] = {}
     last_map: SlamMap | None = None
     for record in reader.records(lambda damage: None):
-        if not record.topic.startswith("slam."):
+        if record.source != "slam":
             continue
         message = decode(frame_of(record))
         match message.topic:

@@ -18,7 +18,7 @@ from pydantic.fields import FieldInfo
 
 from vibrissa.messages.topics import TOPICS
 from vibrissa.processes.config import Experiment
-from vibrissa.processes.table import PROCESSES, SLOTS, listeners, producers
+from vibrissa.processes.table import ALL_SLOTS, PROCESSES, listeners, producers
 
 DOCS: Final = Path(__file__).resolve().parent.parent / "docs"
 _PART: Final = re.compile(r"(<!-- generated: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -126,7 +126,7 @@ def _markdown(columns: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
 
 def _speakers(topic: str) -> str:
     found = producers(topic)
-    named = [name for name in found if name not in SLOTS]
+    named = [name for name in found if name not in ALL_SLOTS]
     return ", ".join([*named, "slots"] if len(named) < len(found) else named)
 
 

@@ -51,12 +51,12 @@ class Story:
         match message.topic:
             case "arm.state":
                 self.truth.append((message.t * 1e-9, *body.pose))
-            case "slam.pose":
+            case "slam.pose" if message.source == "slam":
                 if self.first is None:
                     self.first = body
                 else:
                     self.odometry.append(tuple(body.odometry))
-            case "slam.map":
+            case "slam.map" if message.source == "slam":
                 self.map = body
             case "whisk.calibration":
                 self.calibration, self.calibrated_s = body, message.t * 1e-9

@@ -72,7 +72,7 @@ def tune(
     odometry. Writes a picture of the sweep, and an experiment file with the chosen parameters that
     `run` and `simulate` take. Needs a log of more than one circuit with ground truth.
     """
-    from vibrissa.processes.slam import make_slam_config
+    from vibrissa.processes.slams import make_slam_config
     from vibrissa.slam.tuning import GRID, Recording, choose, dead_reckoning, energies, grid_points
     from vibrissa.tools.dataset import IMAGES, load
 

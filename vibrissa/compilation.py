@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core.caching import IndexDataCacheFile
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -27,15 +28,41 @@ def inlined(function: F) -> F:
     return cast(F, _checked(jit(function)))
 
 
-def _checked(dispatcher: Any) -> Any:
-    """Tie the cached code to every source it was made from.
+class CacheFile(IndexDataCacheFile):
+    """Compiled code on disk, tied to every source it was made from, whoever writes at a time.
 
     numba looks at the file of the function alone, but the code contains what the function calls
-    and the constants it uses. Unnoticed, yesterday's sine would live on in today's kernels.
+    and the constants it uses: unnoticed, yesterday's sine would live on in today's kernels. It
+    also writes the index before the code it points to, under a number that is the next free one:
+    of two processes that compile at once, one could load what the other's number held before,
+    the code of another source or of other argument types. Here a file is named after what it
+    holds, says from which source, and is there before the index names it. Writers that overtake
+    each other lose an entry at most, which is then compiled again.
     """
-    file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
-    if file is not None:
-        file._source_stamp = source_digest(dispatcher.py_func.__code__.co_filename)
+
+    def save(self, key: Any, data: Any) -> None:
+        """Keep `data` as the code of `key`, a signature and its target."""
+        digest = hashlib.sha256(repr(key).encode()).hexdigest()[:16]
+        name = f"{Path(self._index_name).stem}.{digest}.nbc"
+        files: Any = self
+        files._save_data(name, (self._source_stamp, data))
+        files._save_index(files._load_index() | {key: name})
+
+    def load(self, key: Any) -> Any:
+        """The code of `key`; None when there is none, or one of another source."""
+        found: Any = super()
+        stamp, data = found.load(key) or (None, None)
+        return data if stamp == self._source_stamp else None
+
+
+def _checked(dispatcher: Any) -> Any:
+    """Keep the compiled code in a `CacheFile`, where there is a place to keep it."""
+    cache = getattr(dispatcher, "_cache", None)
+    place = getattr(cache, "_impl", None)
+    if cache is not None and place is not None:
+        stamp = source_digest(dispatcher.py_func.__code__.co_filename)
+        make: Any = CacheFile
+        cache._cache_file = make(cache.cache_path, place.filename_base, stamp)
     return dispatcher
 
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from vibrissa.control.calibration import (
     BLOCK,
+    INERTIA,
     Calibration,
     CalibrationError,
     Calibrator,
@@ -15,6 +16,7 @@ from vibrissa.control.calibration import (
     NonFiniteSample,
     TooFewSamples,
     TouchedDuringCalibration,
+    inertial_moment,
 )
 from vibrissa.control.kinematics import PER_RING, WHISKERS, paper_head
 
@@ -212,3 +214,33 @@ def test_impossible_calibrations_are_refused() -> None:
     nothing = np.zeros(WHISKERS)
     with pytest.raises(CalibrationError, match=r"threshold_y: whisker 0 .* is nan"):
         Calibration(nothing, nothing, nothing * np.nan, nothing, nothing, 1)
+
+
+def accelerated(period_ticks: int) -> NDArray[np.float64]:
+    """What heavy but permitted whiskers' inertia makes of two cycles of the full whisk, N m."""
+    head = paper_head()
+    phase = 2.0 * math.pi * np.arange(2 * period_ticks) / period_ticks
+    rate = 2.0 * math.pi * 2000.0 / period_ticks
+    inertia = 0.8 * INERTIA * head.length**3
+    moment: NDArray[np.float64] = np.cos(phase)[:, None] * inertia * head.swing / 2.0 * rate**2
+    return moment
+
+
+@pytest.mark.parametrize("period", [400, 800, 2000])
+def test_the_inertia_of_fast_whisking_is_no_touch(period: int) -> None:
+    noise = np.random.default_rng(period).normal(0.0, 1e-5, (2, 2 * period, WHISKERS))
+    x, y = noise[0], noise[1] + accelerated(period)
+    fast = Calibrator(2, period, inertial=inertial_moment(paper_head(), period))
+    fast.update(x.astype(np.float32), y.astype(np.float32))
+    assert (fast.result().threshold_y > 0.0).all()
+
+
+def test_a_touch_in_fast_whisking_is_still_refused() -> None:
+    period = 400
+    noise = np.random.default_rng(1).normal(0.0, 1e-5, (2, 2 * period, WHISKERS))
+    x, y = noise[0], noise[1] + accelerated(period)
+    y[300:360, 13] += 6e-4
+    fast = Calibrator(2, period, inertial=inertial_moment(paper_head(), period))
+    fast.update(x.astype(np.float32), y.astype(np.float32))
+    with pytest.raises(TouchedDuringCalibration, match=r"whisker 13 \(rear ring\) y excursion"):
+        fast.result()

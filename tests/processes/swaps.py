@@ -147,6 +147,15 @@ def owners(out: Path) -> dict[int, str]:
     return found
 
 
+def samples(out: Path) -> list[int]:
+    """The ticks of all samples in a log."""
+    return [
+        decode(frame_of(record)).body.tick
+        for record in LogReader(out / "run.mcap")
+        if record.topic == "head.sample"
+    ]
+
+
 def identical(out: Path) -> bool:
     """Whether the log re-runs to the same bytes."""
     verdict = verify(out / "run.mcap")

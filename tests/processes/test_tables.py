@@ -14,10 +14,10 @@ from vibrissa.processes.config import Experiment
 from vibrissa.processes.framelog import channels
 from vibrissa.processes.layout import Layout
 from vibrissa.processes.table import (
+    ALL_SLOTS,
     PROCESSES,
     PUBLISHED_BY_HOSTS,
     ROWS,
-    SLOTS,
     Process,
     build,
     listeners,
@@ -89,7 +89,7 @@ def layout(together: list[list[str]]) -> Layout:
     hosts: dict[str, list[str]] = {}
     for name in PROCESSES:
         hosts.setdefault(grouped.get(name, name), []).append(name)
-    names = ["control", "supervisor", "recorder", *hosts, *SLOTS]
+    names = ["control", "supervisor", "recorder", *hosts, *ALL_SLOTS]
     endpoints = {name: f"ipc:///run/{name}" for name in names}
     return Layout(hosts, endpoints, experiment="{}", log="run.mcap", metadata={})
 

@@ -15,7 +15,7 @@ from vibrissa.messages.types import SlamMap, SlamPose, SlamView
 from vibrissa.processes import provenance
 from vibrissa.processes.config import Experiment, load_experiment
 from vibrissa.processes.framelog import FrameLog
-from vibrissa.processes.slam import make_slam_config
+from vibrissa.processes.slams import make_slam_config
 from vibrissa.slam.interface import Odometry
 from vibrissa.slam.ratslam import RatSlam
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.processes.swaps import experiment, identical, owners
-from tests.tools.conftest import Outcome, refused, vibrissa
+from tests.tools.conftest import refused, vibrissa
 from vibrissa.processes.config import load_experiment
 from vibrissa.processes.controllers import make_controller
 from vibrissa.processes.results import RunError
@@ -149,6 +149,21 @@ def test_a_log_whose_controller_is_not_installed_says_so(
         made = experiment(tmp_path, duration=1.6, swaps=((4, "half_amplitude"),))
         simulate(made, tmp_path / "run")
         sys.modules.pop("half_amplitude_controller")
-    outcome: Outcome = vibrissa("verify", tmp_path / "run")
-    assert outcome.code == 1
-    assert "node whisk.1" in outcome.err and "node.answer" in outcome.err
+    for executor in ("fused", "lockstep"):
+        outcome = vibrissa("verify", tmp_path / "run", "--executor", executor)
+        assert refused(outcome, "controller half_amplitude is not installed", "whisk.1", "rcp")
+
+
+def test_a_log_whose_first_controller_is_not_installed_says_so(
+    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patched:
+        patched.syspath_prepend(str(site))
+        made = load_experiment(duration=1.2, controller="half_amplitude")
+        simulate(made, tmp_path / "run")
+        sys.modules.pop("half_amplitude_controller")
+    assert refused(
+        vibrissa("verify", tmp_path / "run"),
+        "whisk can't be made",
+        "controller half_amplitude is not installed",
+    )

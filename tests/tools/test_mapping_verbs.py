@@ -16,7 +16,7 @@ from tests.tools.mapping import PLACES, SENSES, write_log
 from vibrissa.messages.log_format import Record
 from vibrissa.processes.config import load_experiment
 from vibrissa.processes.results import UnusableLogError
-from vibrissa.processes.slam import make_slam_config
+from vibrissa.processes.slams import make_slam_config
 from vibrissa.slam.interface import Odometry
 from vibrissa.slam.metrics import energy_metric, experience_metric, first_circuit, fixed_interval
 from vibrissa.slam.ratslam import RatSlam
