@@ -167,7 +167,8 @@ def settle(work: Floats, box: Ints, wanted: Ints, reach: int, margin: int, n: in
     same = True
     for axis in (ROW, COLUMN):
         length = wanted[axis, LENGTH]
-        closed = length + 2 * (reach + 1) > n
+        # no kernel and no step may see the box from behind
+        closed = length + 2 * reach + margin > n
         wanted[axis, EXTENT] = n if closed else length + 2 * reach
         wanted[axis, FIRST] = margin + (wanted[axis, START] if closed else reach)
         same = same and box[axis, EXTENT] == wanted[axis, EXTENT]
