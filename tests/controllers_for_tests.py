@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from vibrissa.control.calibration import Calibration
 from vibrissa.control.kinematics import Float32s
 from vibrissa.control.open_loop import OpenLoop
 from vibrissa.control.whisk_pattern import WhiskParams
@@ -107,27 +108,11 @@ class SaysWords(Faulty):
         return "fast"
 
 
-class Late(Faulty):
-    """10 ms late from some moment on."""
-
-    def fault(self, command: Float32s) -> Any:
-        time.sleep(0.01)
-        return command
-
-
 class Killed(Faulty):
     """Its process is gone at once, without a word."""
 
     def fault(self, command: Float32s) -> Any:
         os.kill(os.getpid(), signal.SIGKILL)
-
-
-class Stopped(Faulty):
-    """Its process stands still."""
-
-    def fault(self, command: Float32s) -> Any:
-        os.kill(os.getpid(), signal.SIGSTOP)
-        return command
 
 
 def caller(kind: type) -> Any:
@@ -143,24 +128,50 @@ def caller(kind: type) -> Any:
     return None
 
 
-class SaysStaleTicks(Faulty):
-    """Answers the sample of five ticks ago from some moment on."""
+class Ailing(OpenLoop):
+    """A first controller that, once calibrated, is late, then stale, then stands still for good.
 
-    _stale = False
+    In between it is well for long enough to get the drives back, on a machine that is not too busy.
+    """
 
-    def fault(self, command: Float32s) -> Any:
-        if not self._stale:
-            self._stale = True
-            node = caller(WhiskNode)
-            fresh = node.step
+    LATE, STALE, STILL = 400, 2000, 3600
+    """Ticks after the calibration at which it happens."""
+    TICKS = 60
+    """How long the first two last."""
 
-            def step(message: Message) -> Iterator[tuple[str, Any]]:
-                for topic, body in fresh(message):
-                    late = topic == "whisk.command"
-                    yield topic, WhiskCommand(body.tick - 5, body.command) if late else body
+    def __init__(self, whisk: WhiskParams) -> None:
+        super().__init__(whisk)
+        self._calibrated: int | None = None
+        self._now = 0
 
-            node.step = step
+    def calibrate(self, calibration: Calibration) -> None:
+        super().calibrate(calibration)
+        self._calibrated = self._now
+
+    def step(self, tick: int, theta: Float32s, x: Float32s, y: Float32s) -> Float32s:
+        self._now = tick
+        command = super().step(tick, theta, x, y)
+        if self._calibrated is None:
+            return command
+        since = tick - self._calibrated
+        if self.LATE <= since < self.LATE + self.TICKS:
+            time.sleep(0.01)
+        if since == self.STALE:
+            self._say_stale(caller(WhiskNode), tick)
+        if since == self.STILL:
+            os.kill(os.getpid(), signal.SIGSTOP)
         return command
+
+    def _say_stale(self, node: Any, start: int) -> None:
+        """Have answers bear the tick of five samples ago for a while."""
+        fresh = node.step
+
+        def step(message: Message) -> Iterator[tuple[str, Any]]:
+            for topic, body in fresh(message):
+                stale = topic == "whisk.command" and start <= body.tick < start + self.TICKS
+                yield topic, WhiskCommand(body.tick - 5, body.command) if stale else body
+
+        node.step = step
 
 
 class Forger(Faulty):

@@ -24,7 +24,7 @@ EXPERIMENT = """\
 duration = {duration}
 [whisk]
 period = 0.4
-controller = "open_loop"
+controller = "{controller}"
 calibration_cycles = 1
 [controllers]
 {controllers}
@@ -33,13 +33,20 @@ calibration_cycles = 1
 
 
 def experiment(
-    folder: Path, *, duration: float, swaps: tuple[tuple[int, str], ...] = (), **controllers: str
+    folder: Path,
+    *,
+    duration: float,
+    swaps: tuple[tuple[int, str], ...] = (),
+    controller: str = "open_loop",
+    **controllers: str,
 ) -> Experiment:
     """Short cycles, named controllers ("module:Class"), swaps (cycle, name)."""
     named = "\n".join(f'{name} = "{target}"' for name, target in controllers.items())
     listed = "\n".join(f'[[swap]]\nat_cycle = {cycle}\nto = "{name}"' for cycle, name in swaps)
     path = folder / "experiment.toml"
-    path.write_text(EXPERIMENT.format(duration=duration, controllers=named, swaps=listed))
+    path.write_text(
+        EXPERIMENT.format(duration=duration, controller=controller, controllers=named, swaps=listed)
+    )
     return load_experiment(path)
 
 
@@ -65,7 +72,7 @@ class Live:
         """Wait for something to happen."""
         deadline = time.monotonic() + seconds
         while not done():
-            assert self._thread.is_alive(), "the run has ended"
+            assert self._thread.is_alive(), f"the run has ended: {self.supervisor.cause}"
             assert time.monotonic() < deadline, "it did not happen"
             time.sleep(0.02)
 
