@@ -54,7 +54,10 @@ class ArmNode:
                 self._departure = message.t + TICK_NS
             case "run.event" if message.body.kind == "start":
                 self._started = not self._ended
-            case "run.event" | "host.event" if message.body.kind in ("retract", "stop"):
+            case "run.event" | "rig.event" | "host.event" if message.body.kind in (
+                "retract",
+                "stop",
+            ):
                 self._started, self._ended = False, True
         return []
 

@@ -7,6 +7,7 @@ every node of the run.
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import tomllib
 from collections.abc import Iterator
@@ -52,6 +53,35 @@ class Maze(Section):
     text: Annotated[str, Field(description="the file's content; filled in when it is read")] = ""
 
 
+class Rig(Section):
+    """[rig]: the devices, by URL."""
+
+    head: Annotated[
+        str,
+        Field(
+            min_length=1,
+            max_length=200,
+            description="virtual, serial:PORT or can:INTERFACE:CHANNEL",
+        ),
+    ] = "virtual"
+    arm: Annotated[str, Field(min_length=1, max_length=200, description="virtual or rtde:HOST")] = (
+        "virtual"
+    )
+    emulate: Annotated[
+        bool, Field(description="play devices that are not virtual by emulators of this machine")
+    ] = False
+
+    @property
+    def virtual(self) -> bool:
+        """Whether the rig is simulated inside the run, so that a re-run can compute it."""
+        return self.head == self.arm == "virtual"
+
+    @property
+    def real(self) -> bool:
+        """Whether anything real moves, for which a person has to give the start."""
+        return not (self.virtual or self.emulate)
+
+
 class Head(Section):
     """[head]: the simulated head. Ranges are those the mechanics are tested in."""
 
@@ -75,7 +105,18 @@ class Whisk(Section):
     period: Annotated[float, Field(ge=0.2, le=10, description="s per whisk cycle")] = 1.0
     calibration_cycles: Annotated[int, Field(ge=1, le=1000)] = 4
     rcp_gain: Annotated[float, Field(ge=0, le=1000, description="in contact stiffnesses")] = 3.0
+    calibration: Annotated[
+        str, Field(description="file of vibrissa calibrate, instead of calibrating")
+    ] = ""
+    calibration_text: Annotated[
+        str, Field(description="the file's content; filled in when it is read")
+    ] = ""
     rcp_window: Annotated[float, Field(ge=0.0005, le=1, description="s, averaging window")] = 0.01
+
+    @property
+    def calibrated_head(self) -> str:
+        """Serial number of the head that the calibration file is of; empty without one."""
+        return str(json.loads(self.calibration_text)["head"]) if self.calibration_text else ""
 
 
 class Arm(Section):
@@ -85,6 +126,10 @@ class Arm(Section):
         str, Field(pattern="^[CA]{1,100}$", description="C clockwise, A anticlockwise circuits")
     ] = "CCCAAACACA"
     speed: Annotated[float, Field(gt=0, le=0.25, description="m/s")] = 0.04
+    unwind: Annotated[
+        bool,
+        Field(description="turn back between circuits: joints have ends"),
+    ] = False
     lift: Annotated[
         float, Field(ge=0, le=0.3, description="m above the working height while calibrating")
     ] = 0.1
@@ -117,6 +162,7 @@ class Experiment(Section):
 
     run: Run = Run()
     maze: Maze = Maze()
+    rig: Rig = Rig()
     head: Head = Head()
     whisk: Whisk = Whisk()
     arm: Arm = Arm()
@@ -157,6 +203,8 @@ class Experiment(Section):
                 if node in seen:
                     raise ValueError(f"run.together: {node!r} is named twice")
                 seen.add(node)
+        if "rig" in seen and not self.rig.virtual:
+            raise ValueError("run.together: 'rig' is real or emulated, in processes of its own")
         cycles = [swap.at_cycle for swap in self.swap]
         if any(later - earlier < 2 for earlier, later in itertools.pairwise(cycles)):
             raise ValueError("swap: expected at_cycle to grow by at least 2 from entry to entry")
@@ -223,6 +271,7 @@ def _check_parts(experiment: Experiment, where: str) -> None:
     """What only the nodes' own modules can judge: maze, circuit, controller, RatSLAM parameters."""
     from vibrissa.processes.arm import make_path
     from vibrissa.processes.controllers import available
+    from vibrissa.processes.emulators import check
     from vibrissa.processes.slam import make_slam_config
 
     known = available(experiment)
@@ -234,6 +283,7 @@ def _check_parts(experiment: Experiment, where: str) -> None:
     try:
         make_path(experiment)
         make_slam_config(experiment)
+        check(experiment)
     except (ValueError, RunError) as error:
         raise RunError(f"{where}: {error}") from None
 

@@ -122,7 +122,7 @@ class WhiskNode:
             off = np.abs(sample.command - before).max()
             self._disturbed |= bool(off > DISTURBANCE)
             yield from self._calibrate(self._calibrator, sample)
-        if (tick + 1) % self._period == 0:
+        if (tick + 1) // self._period > self._cycle_start // self._period:  # samples may be lost
             cycle = self._cycle(tick, calibrating)
             if self._owner:
                 self._cycles += 1
@@ -199,7 +199,7 @@ class WhiskNode:
 
     def _cycle(self, tick: int, calibrating: bool) -> WhiskCycle:
         cycle = WhiskCycle(
-            cycle=tick // self._period,
+            cycle=self._cycle_start // self._period,
             first_tick=self._cycle_start,
             last_tick=tick,
             calibrating=int(calibrating),

@@ -131,6 +131,7 @@ class ArmDevice(ABC):
         self._heard_ns = 0
         self._tried_ns = 0
         self._setpoint_ns = 0
+        self._tick = 0
 
     def open(self) -> Self:
         """Connect and wait for the first state. Nothing moves.
@@ -199,20 +200,25 @@ class ArmDevice(ABC):
         self._start_motion()
         self._follower = self._make_follower()
         self._setpoint_ns = time.monotonic_ns()
+        self._tick = 0
         self.state, self.cause = State.MOVING, ""
 
     def write(self, tick: int, setpoint: Pose) -> bool:
-        """Where the head shall be one period from now: (x, y, z, yaw), m and rad, maze frame.
+        """Where the head shall be at `tick`, a period from now: (x, y, z, yaw), m, rad, maze frame.
 
-        True when it was sent; False (counted as ignored) while the arm is not enabled. Raises
-        DeviceLimit for a set-point outside the limits and DeviceStopped when the controller takes
-        none any more; either way the arm has then been stopped.
+        Speeds are judged over the ticks since the set-point before. True when it was sent; False
+        (counted as ignored) while the arm is not enabled. Raises DeviceLimit for a set-point
+        outside the limits and DeviceStopped when the controller takes none any more; either way the
+        arm has then been stopped.
         """
         if self.state is not State.MOVING or self._follower is None:
             self.counters.ignored += 1
             return False
+        since = min(tick - self._tick, self.limits.stale_setpoint_ticks)
+        seconds = since * TICK_NS * 1e-9 if self._tick and since > 0 else None
+        self._tick = tick
         try:
-            self._follower.follow(f"{self.name} set-point, tick {tick}", setpoint)
+            self._follower.follow(f"{self.name} set-point, tick {tick}", setpoint, seconds)
         except DeviceLimit as error:
             self.counters.refused += 1
             self.stop(str(error))

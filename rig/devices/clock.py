@@ -62,3 +62,39 @@ class ClockRelation:
         xx = sum((p[0] - x0 - x) ** 2 for p in self._points)
         xy = sum((p[0] - x0 - x) * (p[1] - y0 - y) for p in self._points)
         return x0 + x, y0 + y, xx, xy
+
+
+class CycleTicks:
+    """Ticks of a run for the cycles of a device with a clock of its own.
+
+    Cycles are as far apart as the device stamps them, so that a path sampled at these ticks is as
+    smooth as the device's clock; the ticks follow the host's by one tick per cycle.
+    """
+
+    SLACK: Final = 8
+    """Ticks the arrival of a cycle may be off, by which nothing is corrected."""
+    STEP: Final = 2000
+    """Ticks off beyond which the device's clock was set: its cycles start afresh."""
+
+    def __init__(self, period: float) -> None:
+        """period: s, between cycles."""
+        self._ticks_per_s = 2000.0
+        self._period = period
+        self._last: tuple[float, int] | None = None
+
+    def tick(self, stamp: float, now: int) -> int:
+        """The tick of the cycle stamped `stamp` s that came at tick `now`; always a later one."""
+        if self._last is None:
+            self._last = stamp, max(now, 0)
+            return self._last[1]
+        before, last = self._last
+        cycles = max(round((stamp - before) / self._period), 1)
+        tick = last + max(round(cycles * self._period * self._ticks_per_s), 1)
+        off = now - tick
+        if not -self.STEP < off < self.STEP:
+            tick = now
+        elif abs(off) > self.SLACK:
+            tick += 1 if off > 0 else -1
+        tick = max(tick, last + 1)
+        self._last = stamp, tick
+        return tick

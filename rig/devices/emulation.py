@@ -259,6 +259,7 @@ def head_arguments(description: str) -> argparse.ArgumentParser:
     parser.add_argument("--hear", type=int, help="port of 127.0.0.1 for poses, 0: any")
     parser.add_argument("--serial", default="VIB-EMU-1", help="which head this is")
     parser.add_argument("--seed", type=int, default=1, help="of noise, boot numbers and errors")
+    parser.add_argument("--plant", type=json.loads, default={}, help="HeadPlantParams as JSON")
     parser.add_argument("--drift", type=float, default=0.0, help="of its clock, ppm")
     parser.add_argument("--jitter", type=float, default=0.0, help="of its ticks, us")
     parser.add_argument("--protocol", type=int, default=1, help="protocol version it claims")

@@ -20,14 +20,14 @@ from vibrissa.rig.devices.emulation import (
 from vibrissa.rig.devices.firmware import Firmware
 from vibrissa.rig.devices.protocol import Hello, RawSample, standard_map
 from vibrissa.rig.maze import parse_maze
-from vibrissa.rig.plant import HeadPlant
+from vibrissa.rig.plant import HeadPlant, HeadPlantParams
 from vibrissa.rig.scene import wall_boxes
 
 
 def make_firmware(arguments: argparse.Namespace, ear: PoseEar) -> Firmware:
     """A head over the maze of the command line."""
     maze = parse_maze(maze_text(arguments.maze), arguments.maze or "the shipped board")
-    plant = HeadPlant(wall_boxes(maze), arguments.seed)
+    plant = HeadPlant(wall_boxes(maze), arguments.seed, HeadPlantParams(**arguments.plant))
     hello = Hello(0, 0, (1, 0, 0), arguments.serial, channels=standard_map()[: arguments.channels])
     return Firmware(plant, ear.listen, hello, arguments.seed)
 

@@ -29,7 +29,9 @@ class HeadLimits:
     """Of the whisker drives.
 
     low, high      rad, float32[18], range of a command: the swing and the margin of the stops
-    silence_ticks  without a sample after which the loop must retract: the firmware's own watchdog
+    watchdog_ticks without a command after which the firmware itself retracts the whiskers
+    silence_ticks  without a sample after which a run stops: whiskers retract, the arm brakes
+    overrun_ticks  of samples without a command to answer them after which a run stops
     patience       s without a sample after which the head counts as lost
     """
 
@@ -37,7 +39,9 @@ class HeadLimits:
     high: Float32s = field(
         default_factory=lambda: (paper_head().swing + STOP_MARGIN).astype(np.float32)
     )
-    silence_ticks: int = 40
+    watchdog_ticks: int = 40
+    silence_ticks: int = 200
+    overrun_ticks: int = 200
     patience: float = 5.0
 
     def check(self, tick: int, command: Float32s) -> None:
@@ -69,6 +73,7 @@ class ArmLimits:
     start_jump        m and rad, the first set-point may be this far from where the arm is
     stale_ticks       without a new state after which the arm is stopped
     stale_setpoint_ticks  without a new set-point after which the arm is decelerated
+    blind_ticks       without news of the head after which the arm is stopped
     watchdog          Hz, slower than this and the controller itself stops the program
     patience          s without a state after which the arm counts as lost
     """
@@ -86,6 +91,7 @@ class ArmLimits:
     start_jump: float = 0.02
     stale_ticks: int = 200
     stale_setpoint_ticks: int = 160
+    blind_ticks: int = 400
     watchdog: float = 10.0
     patience: float = 5.0
 
@@ -157,12 +163,13 @@ class Follower:
         self.q = q
         self._first = True
 
-    def follow(self, where: str, pose: Pose) -> None:
-        """Take one set-point. Raises DeviceLimit, and then nothing has changed.
+    def follow(self, where: str, pose: Pose, seconds: float | None = None) -> None:
+        """Take one set-point, `seconds` of the path (default: a period) after the one before.
 
-        The same set-point again is always fine: it asks the servo to brake and hold.
+        Raises DeviceLimit, and then nothing has changed. The same set-point again is always fine:
+        it asks the servo to brake and hold.
         """
-        limits = self.limits
+        limits, period = self.limits, seconds or self.period
         limits.check_pose(where, pose)
         turned = math.remainder(pose[3] - self.pose[3], 2 * math.pi)
         steps = [b - a for a, b in zip(self.pose[:3], pose, strict=False)] + [turned]
@@ -172,17 +179,16 @@ class Follower:
                 f"{where}: expected a first set-point within {limits.start_jump} m and rad of the "
                 f"arm, found it {jump:.4g} away"
             )
-        vx, vy, vz, turn = (s / self.period for s in steps)
+        vx, vy, vz, turn = (s / period for s in steps)
         velocity = (vx, vy, vz, turn)
         if not self._first and pose != self.pose:
-            limits.check_rates(where, velocity, self.velocity, self.period)
+            limits.check_rates(where, velocity, self.velocity, period)
         q = self.q
         if self.mount is not None and q is not None:
             q = ur10.nearest(self.mount.flange(pose), q)
             if q is None:
                 raise DeviceLimit(f"{where}: expected a pose in reach, found {_text(pose)}")
-            seconds = math.inf if self._first else self.period
-            limits.check_joints(where, q, self.q or q, seconds)
+            limits.check_joints(where, q, self.q or q, math.inf if self._first else period)
         self.pose, self.q = pose, q
         self.velocity = (0.0, 0.0, 0.0, 0.0) if self._first else velocity
         self._first = False

@@ -69,5 +69,5 @@ def test_whatever_passes_is_within_speed_and_workspace(setpoints: list[Pose]) ->
 
 
 def test_the_firmwares_watchdog_and_the_loops_patience_agree() -> None:
-    assert HEAD.silence_ticks == WATCHDOG_TICKS
+    assert HEAD.watchdog_ticks == WATCHDOG_TICKS
     assert ARM.stale_setpoint_ticks / 2000 < 1.0 / ARM.watchdog  # ours is first
