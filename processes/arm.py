@@ -26,6 +26,7 @@ def make_path(experiment: Experiment) -> ArmPath:
     motion = Motion(
         speed=experiment.arm.speed,
         lift=experiment.arm.lift,
+        unwind=experiment.arm.unwind,
     )
     route = circuit(maze.width, maze.height, experiment.arm.sequence, pitch=maze.pitch)
     corner = (maze.width * maze.pitch + MARGIN, maze.height * maze.pitch + MARGIN, 0.4)

@@ -110,7 +110,8 @@ class ArmPump(Pump):
             self.give_up(str(error))
             return
         self.watch.start(self.now)
-        self.report("enabled", f"{self._arm.name}: set-points go through from here on")
+        who = f"{self._arm.info.name}, controller {self._arm.info.version}"
+        self.report("enabled", f"{self._arm.name}: {who}: set-points go through from here on")
 
     def _moved(self, report: ArmReport) -> None:
         self._tell(report.pose)

@@ -7,7 +7,6 @@ every node of the run.
 from __future__ import annotations
 
 import itertools
-import json
 import math
 import tomllib
 from collections.abc import Iterator
@@ -18,6 +17,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from vibrissa.messages.types import TICK_HZ
+from vibrissa.processes.calibration_file import VIRTUAL_HEAD, from_text
 from vibrissa.processes.results import RunError
 
 DEFAULT_MAZE = "board7x5.maze"
@@ -116,7 +116,9 @@ class Whisk(Section):
     @property
     def calibrated_head(self) -> str:
         """Serial number of the head that the calibration file is of; empty without one."""
-        return str(json.loads(self.calibration_text)["head"]) if self.calibration_text else ""
+        if not self.calibration_text:
+            return ""
+        return from_text(self.calibration_text, self.calibration)[1]
 
 
 class Arm(Section):
@@ -263,6 +265,15 @@ def load_experiment(
             raise RunError(f"{where}: {error}") from None
         maze = experiment.maze.model_copy(update={"text": text})
         experiment = experiment.model_copy(update={"maze": maze})
+    named = experiment.whisk.calibration
+    if named and not experiment.whisk.calibration_text:
+        try:
+            learnt = ((path.parent if path else Path()) / named).read_text()
+        except (OSError, UnicodeDecodeError) as error:
+            why = getattr(error, "strerror", None) or error
+            raise RunError(f"{where}: whisk.calibration {named!r}: {why}") from None
+        whisk = experiment.whisk.model_copy(update={"calibration_text": learnt})
+        experiment = experiment.model_copy(update={"whisk": whisk})
     _check_parts(experiment, where)
     return experiment
 
@@ -284,6 +295,9 @@ def _check_parts(experiment: Experiment, where: str) -> None:
         make_path(experiment)
         make_slam_config(experiment)
         check(experiment)
+        of = experiment.whisk.calibrated_head
+        if of not in ("", VIRTUAL_HEAD) and experiment.rig.head == "virtual":
+            raise RunError(f"whisk.calibration is of head {of}, rig.head is virtual")
     except (ValueError, RunError) as error:
         raise RunError(f"{where}: {error}") from None
 

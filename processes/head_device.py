@@ -90,6 +90,7 @@ class HeadPump(Pump):
                 self._pose = x, y, z, yaw
             case "run.event" if message.body.kind == "start":
                 self.watch.start(self.now)
+                self.report("opened", f"{self._head.name}: {self._head.info.describe()}")
 
     def halt(self, cause: str) -> None:
         """The sampler retracts; where no command comes any more, the head does by itself."""

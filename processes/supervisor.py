@@ -117,7 +117,7 @@ class Supervisor:
         self.sent: collections.Counter[str] = collections.Counter()
         self.cause: str | None = None
         self.requests = Requests(self)
-        self._calibration: WhiskCalibration | None = None
+        self.calibration: WhiskCalibration | None = None
         self._seq: collections.Counter[str] = collections.Counter()
         self._interrupted = 0
         self.started = start or not experiment.rig.real
@@ -384,15 +384,15 @@ class Supervisor:
 
     def hand_over_calibration(self) -> bool:
         """Repeat the calibration for newcomers; False when there is none yet."""
-        if self._calibration is None:
+        if self.calibration is None:
             return False
-        self._publish("run.calibration", self._calibration)
+        self._publish("run.calibration", self.calibration)
         return True
 
     def _expendable(self, name: str) -> bool:
         """Whether the run goes on without this process: it hosts one controller of several."""
         others = self.requests.slots.keys() - {name}
-        return name in SLOTS or (name == "whisk" and self._calibration is not None and bool(others))
+        return name in SLOTS or (name == "whisk" and self.calibration is not None and bool(others))
 
     def _lose(self, child: Child, why: str) -> None:
         """A controller is lost; the arbiter falls back if it had the drives; the run goes on."""
@@ -422,7 +422,7 @@ class Supervisor:
     def _check_controllers(self, why: str) -> None:
         """End a run that has no controller left, or none that could be calibrated."""
         slots = self.requests.slots
-        if not slots or ("whisk" not in slots and self._calibration is None):
+        if not slots or ("whisk" not in slots and self.calibration is None):
             self.cause = self.cause or f"no controller left: {why}"
 
     def _until(self, seconds: float, phase: str, done: Any) -> None:
@@ -457,7 +457,7 @@ class Supervisor:
                 continue
             self.requests.heard(message)
             if message.topic == "whisk.calibration":
-                self._calibration = message.body
+                self.calibration = message.body
             if message.topic == "whisk.failure":
                 self._failed(message.source, message.body)
             if message.topic == "rig.event":

@@ -131,7 +131,7 @@ class ArmDevice(ABC):
         self._heard_ns = 0
         self._tried_ns = 0
         self._setpoint_ns = 0
-        self._tick = 0
+        self._last_tick = 0
 
     def open(self) -> Self:
         """Connect and wait for the first state. Nothing moves.
@@ -200,7 +200,7 @@ class ArmDevice(ABC):
         self._start_motion()
         self._follower = self._make_follower()
         self._setpoint_ns = time.monotonic_ns()
-        self._tick = 0
+        self._last_tick = 0
         self.state, self.cause = State.MOVING, ""
 
     def write(self, tick: int, setpoint: Pose) -> bool:
@@ -214,9 +214,9 @@ class ArmDevice(ABC):
         if self.state is not State.MOVING or self._follower is None:
             self.counters.ignored += 1
             return False
-        since = min(tick - self._tick, self.limits.stale_setpoint_ticks)
-        seconds = since * TICK_NS * 1e-9 if self._tick and since > 0 else None
-        self._tick = tick
+        since = min(tick - self._last_tick, self.limits.stale_setpoint_ticks)
+        seconds = since * TICK_NS * 1e-9 if self._last_tick and since > 0 else None
+        self._last_tick = tick
         try:
             self._follower.follow(f"{self.name} set-point, tick {tick}", setpoint, seconds)
         except DeviceLimit as error:
