@@ -27,7 +27,7 @@ from vibrissa.processes.config import Experiment
 from vibrissa.processes.control import ControlLine
 from vibrissa.processes.gate import Gate
 from vibrissa.processes.layout import Layout
-from vibrissa.processes.results import one_line
+from vibrissa.processes.results import RunError, one_line
 from vibrissa.processes.stats import Clocking
 from vibrissa.processes.table import DEVICES
 from vibrissa.rig.devices.arm import ArmDevice
@@ -76,29 +76,27 @@ class Pump(ABC):
         self._flushed = self._housekept = self._accounted = 0
 
     def run(self) -> None:
-        """Open, barrier, loop, farewell. Raises DeviceError when the device can't be opened."""
-        with self.device:
-            self.opened()
-            wanted = self.layout.audience(self.name)
-            waiting = self.control.wait_for_go(self._parent, self.port.subscribers, wanted)
-            try:
-                while True:
-                    next(waiting)
-                    self.drain()
-            except StopIteration as end:
-                self.t0 = end.value
-            cpu = time.process_time()
-            try:
-                while not self.stopping:
-                    self.turn()
-                    self._housekeep()
-            except DeviceError as error:
-                self.give_up(str(error))
-            except Exception as error:
-                traceback.print_exc()
-                self.give_up(f"{type(error).__name__}: {error}")
-            self._account()
-            self.port.flush()
+        """Open, barrier, loop, farewell; SystemExit when the device can't be used."""
+        try:
+            self._prepare()
+        except (DeviceError, RunError) as error:
+            self.control.say("fault", cause=str(error)[:400])
+            self._leave()
+            raise SystemExit(2) from None
+        cpu = time.process_time()
+        try:
+            while not self.stopping:
+                self.turn()
+                self._housekeep()
+        except DeviceError as error:
+            self.give_up(str(error))
+        except Exception as error:
+            traceback.print_exc()
+            self.give_up(f"{type(error).__name__}: {error}")
+        finally:
+            self.device.close()
+        self._account()
+        self.port.flush()
         self.control.say(
             "bye",
             sent=dict(self.sent),
@@ -107,6 +105,25 @@ class Pump(ABC):
             counters={self.name: self.counters()},
         )
         self.control.wait_to_leave(self._parent)
+        self._leave()
+
+    def _prepare(self) -> None:
+        """Open the device, wait for the others and for the go, reading on meanwhile."""
+        self.device.open()
+        try:
+            self.opened()
+            wanted = self.layout.audience(self.name)
+            waiting = self.control.wait_for_go(self._parent, self.port.subscribers, wanted)
+            while True:
+                next(waiting)
+                self.drain()
+        except StopIteration as end:
+            self.t0 = end.value
+        except BaseException:
+            self.device.close()
+            raise
+
+    def _leave(self) -> None:
         self.control.close()
         self.port.close()
         self.context.term()

@@ -311,7 +311,9 @@ class ArmDevice(ABC):
         limits = self.limits
         idle = now - self._setpoint_ns
         if self.state is State.MOVING and idle > limits.stale_setpoint_ticks * TICK_NS:
-            self.stop(f"no set-point for {limits.stale_setpoint_ticks} ticks")
+            silent = now - self._heard_ns > idle  # set-points answer states
+            what = "no state, so no set-point" if silent else "no set-point"
+            self.stop(f"{what} for {limits.stale_setpoint_ticks} ticks")
         silence = now - self._heard_ns
         if silence <= limits.stale_ticks * TICK_NS:
             return
