@@ -209,7 +209,7 @@ def test_nothing_moves_before_the_operators_start_and_everything_stops_without_a
         out = tmp_path / "run"
         file = tmp_path / "devices.toml"
         code = "from vibrissa.tools.cli import main; main()"
-            command = [sys.executable, "-c", code, "run", str(file), "--out", str(out)]
+        command = [sys.executable, "-c", code, "run", str(file), "--out", str(out)]
         popen = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
             wait_for(lambda: _asked_to_wait(out), "a run that waits")
