@@ -53,7 +53,10 @@ class ArmPump(Pump):
         try:
             self._arm.check(travelled(self._path, self.last_tick, self._arm.info.period))
         except DeviceLimit as error:
-            raise RunError(f"rig.arm {self._arm.name}: {error}; what helps: {REMEDY}") from None
+            x, y, z, yaw = self._path.pose(0)
+            begin = f"the path begins at x {x:.4f}, y {y:.4f}, z {z:.4f} m, yaw {yaw:.4f} rad"
+            helps = f"what helps: {REMEDY}" if " joint" in str(error) else begin
+            raise RunError(f"rig.arm {self._arm.name}: {error}; {helps}") from None
 
     def drain(self) -> None:
         while (report := self._arm.read(0)) is not None:

@@ -30,7 +30,8 @@ class HeadLimits:
 
     low, high      rad, float32[18], range of a command: the swing and the margin of the stops
     watchdog_ticks without a command after which the firmware itself retracts the whiskers
-    silence_ticks  without a sample after which a run stops: whiskers retract, the arm brakes
+    silence_ticks  without a sample after which a run stops: whiskers retract, the arm brakes; more
+                   than a head that was reset needs to be asked and to answer
     overrun_ticks  of samples without a command to answer them after which a run stops
     patience       s without a sample after which the head counts as lost
     """
@@ -40,8 +41,8 @@ class HeadLimits:
         default_factory=lambda: (paper_head().swing + STOP_MARGIN).astype(np.float32)
     )
     watchdog_ticks: int = 40
-    silence_ticks: int = 200
-    overrun_ticks: int = 200
+    silence_ticks: int = 400
+    overrun_ticks: int = 400
     patience: float = 5.0
 
     def check(self, tick: int, command: Float32s) -> None:
@@ -91,7 +92,7 @@ class ArmLimits:
     start_jump: float = 0.02
     stale_ticks: int = 200
     stale_setpoint_ticks: int = 160
-    blind_ticks: int = 400
+    blind_ticks: int = 600
     watchdog: float = 10.0
     patience: float = 5.0
 

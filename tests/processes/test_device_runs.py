@@ -24,6 +24,7 @@ from tests.conftest import Recorded
 from tests.processes.live import Schedule, wait_for
 from tests.processes.logs import message
 from vibrissa.messages.types import Event
+from vibrissa.processes.arm import make_path
 from vibrissa.processes.client import Client
 from vibrissa.processes.config import Experiment, load_experiment
 from vibrissa.processes.replay import what_if
@@ -194,17 +195,19 @@ def test_a_fault_of_a_device_retracts_the_whiskers_stops_the_arm_and_ends_the_ru
 
 
 @contextlib.contextmanager
-def rig_of_emulators() -> Iterator[tuple[EmulatorProcess, EmulatorProcess]]:
-    """A head and an arm that look real to a run."""
-    with EmulatorProcess("serial") as head, EmulatorProcess("rtde", ["--host", "127.0.2.9"]) as arm:
-        yield head, arm
+def rig_of_emulators(folder: Path) -> Iterator[tuple[Experiment, EmulatorProcess]]:
+    """A run whose head and arm look real to it, and the arm."""
+    begin = make_path(experiment(folder, 60.0)).pose(0)
+    pose = "--pose=" + ",".join(map(repr, begin))
+    host = ["--host", "127.0.2.9"]
+    with EmulatorProcess("serial", [pose]) as head, EmulatorProcess("rtde", [*host, pose]) as arm:
+        yield experiment(folder, 60.0, head.url, arm.url, "false"), arm
 
 
 def test_nothing_moves_before_the_operators_start_and_everything_stops_without_a_supervisor(
     tmp_path: Path,
 ) -> None:
-    with rig_of_emulators() as (head, arm):
-        asked = experiment(tmp_path, 60.0, head.url, arm.url, "false")
+    with rig_of_emulators(tmp_path) as (asked, arm):
         assert asked.rig.real
         out = tmp_path / "run"
         file = tmp_path / "devices.toml"
