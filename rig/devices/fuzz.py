@@ -2,9 +2,9 @@
 
 Frames, whole and mutilated, go to the parsers of the drivers and to the emulators' ears: the head's
 serial framing both ways, its CAN frames both ways, the RTDE packets both ways and the dashboard.
-Mutations that make a target count something new are kept and mutated further (coverage by the
-counters and kinds of answer, not by branches). Fails on an exception, on memory that grows and on a
-target that takes too long.
+Mutations that make a target count something new are kept and mutated further; with --coverage also
+those that reach a new branch of the devices' code. Fails on an exception, on memory that grows and
+on a target that takes too long.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ import sys
 import time
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from pathlib import Path
+from types import FrameType
+from typing import Any, Final
 
 from vibrissa.rig.devices import can_layout, protocol, ur10
 from vibrissa.rig.devices.framing import FrameParser, frame
@@ -44,6 +46,7 @@ from vibrissa.rig.devices.rtde_wire import (
     packet,
 )
 
+PACKAGE: Final = str(Path(protocol.__file__).parent)
 KEPT: Final = 2000
 """Interesting inputs kept per target."""
 GROWTH_KB: Final = 64 << 10
@@ -193,9 +196,49 @@ def mutate(data: bytes, other: bytes, rng: random.Random) -> bytes:
     return data
 
 
-def run(frames: int, seed: int = 0, report: Callable[[str], None] = print) -> None:
+class Branches:
+    """The branches of this package's code that a call takes: pairs of lines, one after the other."""
+
+    def __init__(self) -> None:
+        self.taken: set[tuple[int, int, int]] = set()
+        self._last = 0
+
+    def new(self, hear: Callable[[bytes], Hashable], data: bytes) -> tuple[Hashable, bool]:
+        """The answer to `data`, and whether a branch was taken for the first time."""
+        known = len(self.taken)
+        before = sys.gettrace()
+        sys.settrace(self._call)
+        try:
+            answer = hear(data)
+        finally:
+            sys.settrace(before)
+        return answer, len(self.taken) > known
+
+    def _call(self, frame: FrameType, _event: str, _argument: object) -> Any:
+        ours = frame.f_code.co_filename.startswith(PACKAGE)
+        self._last = 0
+        return self._line if ours else None
+
+    def _line(self, frame: FrameType, _event: str, _argument: object) -> Any:
+        line = frame.f_lineno
+        self.taken.add((id(frame.f_code), self._last, line))
+        self._last = line
+        return self._line
+
+
+def run(
+    frames: int,
+    seed: int = 0,
+    report: Callable[[str], None] = print,
+    *,
+    coverage: bool = False,
+) -> None:
     """Feed so many frames, spread over all targets. Raises what a target raises, or MemoryError
-    and TimeoutError when one grows or dawdles."""
+    and TimeoutError when one grows or dawdles.
+
+    coverage: keep what reaches a new branch, too; several times slower.
+    """
+    branches = Branches() if coverage else None
     signal.signal(signal.SIGVTALRM, _hung)
     rng = random.Random(seed)
     everybody = targets()
@@ -205,7 +248,7 @@ def run(frames: int, seed: int = 0, report: Callable[[str], None] = print) -> No
     while any(target.frames < share for target in everybody):
         for target in everybody:
             signal.setitimer(signal.ITIMER_VIRTUAL, SLOW_S)
-            _spell(target, min(step, share - target.frames), rng)
+            _spell(target, min(step, share - target.frames), rng, branches)
         used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         floor = floor or used
         if used - floor > GROWTH_KB:
@@ -216,6 +259,8 @@ def run(frames: int, seed: int = 0, report: Callable[[str], None] = print) -> No
         report(
             f"{target.name:12} {target.frames:>10} frames, {len(target.seen):>5} kinds of answer"
         )
+    if branches is not None:
+        report(f"{len(branches.taken)} branches taken")
     seconds = time.monotonic() - begun
     report(f"{total} frames in {seconds:.1f} s, no crash, no hang, memory within {GROWTH_KB} kB")
 
@@ -224,16 +269,21 @@ def _hung(*_: object) -> None:
     raise TimeoutError(f"fuzz: a spell took more than {SLOW_S:g} s of processor time")
 
 
-def _spell(target: Target, count: int, rng: random.Random) -> None:
+def _spell(
+    target: Target, count: int, rng: random.Random, branches: Branches | None = None
+) -> None:
     pool, seen, hear = target.pool or list(target.seeds), target.seen, target.hear
     for _ in range(count):
         data = mutate(rng.choice(pool), rng.choice(pool), rng)[:2048]
         try:
-            answer = hear(data)
+            if branches is None:
+                answer, fresh = hear(data), False
+            else:
+                answer, fresh = branches.new(hear, data)
         except BaseException:
             sys.stderr.write(f"fuzz: {target.name}: failed on {data.hex()}\n")
             raise
-        if answer not in seen and len(seen) < KEPT:
+        if (fresh or answer not in seen) and len(pool) < KEPT:
             seen.add(answer)
             pool.append(data)
     target.pool = pool
@@ -245,8 +295,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Fuzz the devices' parsers and emulators.")
     parser.add_argument("--frames", type=int, default=1_000_000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--coverage", action="store_true", help="be guided by branches, too")
     arguments = parser.parse_args()
-    run(arguments.frames, arguments.seed)
+    run(arguments.frames, arguments.seed, coverage=arguments.coverage)
 
 
 if __name__ == "__main__":

@@ -30,6 +30,17 @@ def test_a_short_run_of_the_fuzzer_passes() -> None:
     assert len(lines) == 8 and lines[-1].startswith("70007 frames")
 
 
+def test_guided_by_branches_the_fuzzer_keeps_what_reaches_new_ones() -> None:
+    branches = fuzz.Branches()
+    target = next(t for t in fuzz.targets() if t.name == "serial up")
+    assert branches.new(target.hear, target.seeds[0])[1]
+    assert not branches.new(target.hear, target.seeds[0])[1], "taken before"
+    assert branches.new(target.hear, b"\x00garbage\x00")[1], "the damaged frame's branch"
+    lines: list[str] = []
+    fuzz.run(1_400, seed=2, report=lines.append, coverage=True)
+    assert any("branches taken" in line for line in lines)
+
+
 def test_the_fuzzer_notices_a_crash() -> None:
     def fragile(data: bytes) -> int:
         return data[100]

@@ -50,7 +50,14 @@ head = "{head}"
 arm = "{arm}"
 emulate = {emulate}
 """
-BUSY = ("no sample for", "no command for", "no news of the head", "takes no set-points", "no news")
+BUSY = (
+    "no sample for",
+    "no command for",
+    "no news",
+    "no set-point",
+    "no state",
+    "takes no set-points",
+)
 
 
 def experiment(
