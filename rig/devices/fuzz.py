@@ -197,7 +197,7 @@ def mutate(data: bytes, other: bytes, rng: random.Random) -> bytes:
 
 
 class Branches:
-    """The branches of this package's code that a call takes: pairs of lines, one after the other."""
+    """Branches of this package that a call takes: pairs of lines, one after the other."""
 
     def __init__(self) -> None:
         self.taken: set[tuple[int, int, int]] = set()

@@ -90,10 +90,10 @@ class ArmLimits:
     tilt: float = 2.0 * DEGREE
     deceleration: float = 2.0
     start_jump: float = 0.02
-    stale_ticks: int = 200
-    stale_setpoint_ticks: int = 160
+    stale_ticks: int = 400
+    stale_setpoint_ticks: int = 320
     blind_ticks: int = 600
-    watchdog: float = 10.0
+    watchdog: float = 5.0
     patience: float = 5.0
 
     def check_pose(self, where: str, pose: Pose) -> None:
