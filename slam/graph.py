@@ -70,10 +70,11 @@ class Graph:
 @dataclass(frozen=True, slots=True)
 class Solution:
     """poses float64[n, 3], headings not wrapped; weights float64[m]: 1 for a loop that agrees with
-    all others, towards 0 for one that is contradicted."""
+    all others, towards 0 for one that is contradicted; cost: what was minimised, chi^2."""
 
     poses: Floats
     weights: Floats
+    cost: float
 
 
 def optimise(graph: Graph, start: Floats, params: GraphParams) -> Solution:
@@ -84,7 +85,7 @@ def optimise(graph: Graph, start: Floats, params: GraphParams) -> Solution:
     poses = start.copy()
     weights = np.ones(len(graph.loops))
     if len(graph.loops) == 0 or len(poses) < 2:
-        return Solution(poses, weights)
+        return Solution(poses, weights, 0.0)
     nodes = len(poses)
     pairs, slots = block_pairs(nodes, graph.loops)
     structure = analyse(nodes, pairs)
@@ -93,7 +94,17 @@ def optimise(graph: Graph, start: Floats, params: GraphParams) -> Solution:
         weigh(graph.loops, graph.turns, poses, params, scale, weights)
         step = _newton(graph, structure, slots, poses, params, weights)
         poses += step
-    return Solution(poses, weights)
+    cost = _cost(
+        graph.steps,
+        graph.loops,
+        graph.turns,
+        poses,
+        params.lateral,
+        params.loop_place,
+        params.loop_heading,
+        params.robust,
+    )
+    return Solution(poses, weights, cost)
 
 
 def block_pairs(nodes: int, loops: Ints) -> tuple[NDArray[np.int32], Ints]:
@@ -158,6 +169,31 @@ def weigh(
 ) -> None:
     """Fill the robust weights of all loops for a scale (chi^2)."""
     _weigh(loops, turns, poses, params.loop_place, params.loop_heading, scale, weights)
+
+
+@compiled
+def _cost(
+    steps: Floats,
+    loops: Ints,
+    turns: Floats,
+    poses: Floats,
+    lateral: float,
+    place: float,
+    heading: float,
+    robust: float,
+) -> float:
+    total = 0.0
+    r, w = np.empty(3), np.empty(3)
+    j_a, j_b = np.empty((3, 3)), np.empty((3, 3))
+    for i in range(steps.shape[0]):
+        step_residual(steps[i], poses[i], poses[i + 1], lateral, r, w, j_a, j_b)
+        for k in range(3):
+            total += w[k] * r[k] * r[k]
+    for k in range(loops.shape[0]):
+        x, y, h = loop_residual(loops, turns, poses, k)
+        chi2 = (x * x + y * y) / (place * place) + h * h / (heading * heading)
+        total += robust * chi2 / (robust + chi2)
+    return total
 
 
 @compiled

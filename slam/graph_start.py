@@ -26,16 +26,19 @@ def start_values(
     loops: Ints,
     facing: NDArray[np.int8],
     loop_heading: float,
+    other: NDArray[np.bool_],
     turns: Floats,
+    surprise: Floats,
 ) -> None:
     """Fill poses float64[n, 3] after node `first` (headings not wrapped) and turns float64[m].
 
     poses up to `first` are given. steps float64[n - 1, 4]: distance, turn and their standard
     deviations, of the step that ends at node 1, 2, ..; loops int64[m, 2] in ascending order of
     their later node (column 0), all after `first`; facing int8[m]: 1 when the two face opposite
-    ways. turns: the heading of one over the other, with its whole turns. A scalar Kalman filter of
-    the heading in the map of its own past, which counts as known. Without loops the poses are dead
-    reckoning.
+    ways. turns: the heading of one over the other, with as many whole turns as make it nearest to
+    what was expected, or second nearest where `other` bool[m] says so; surprise float64[m]: how far
+    from it, rad. A scalar Kalman filter of the heading in the map of its own past, which counts as
+    known. Without loops the poses are dead reckoning.
     """
     uncertain = 0.0
     k = 0
@@ -47,6 +50,9 @@ def start_values(
             heading = poses[i - 1, 2] + turn
             past = poses[loops[k, 1], 2]
             turns[k] = half + TAU * math.floor((heading - past - half) / TAU + 0.5)
+            surprise[k] = past + turns[k] - heading
+            if other[k]:
+                turns[k] += -TAU if surprise[k] > 0.0 else TAU
             gain = uncertain / (uncertain + loop_heading * loop_heading)
             turn += gain * (past + turns[k] - heading)
             uncertain *= 1.0 - gain

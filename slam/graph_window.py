@@ -33,8 +33,9 @@ def refine(
     """
     loops_from = int(np.searchsorted(loops[:, 0], first + 2))
     loops, facing = loops[loops_from:], facing[loops_from:]
-    turns = np.empty(len(loops))
-    start_values(poses, first, steps, loops, facing, params.loop_heading, turns)
+    turns, surprise = np.empty(len(loops)), np.empty(len(loops))
+    nearest = np.zeros(len(loops), dtype=np.bool_)
+    start_values(poses, first, steps, loops, facing, params.loop_heading, nearest, turns, surprise)
     if len(loops) == 0:
         return
     scales = np.array([params.scale(k) for k in range(params.iterations)])

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.slam.angles import wrap_pi
-from vibrissa.slam.graph import Graph, GraphParams, optimise
-from vibrissa.slam.graph_start import reckon, start_values
+from vibrissa.slam.graph import GraphParams
+from vibrissa.slam.graph_start import reckon
+from vibrissa.slam.graph_winding import solve_unwound
 from vibrissa.slam.graph_window import refine
 from vibrissa.slam.growing import grown
 from vibrissa.slam.interface import (
@@ -94,6 +95,7 @@ class SequenceSlam:
         self._at_once = max(1, min(config.decide_every, config.lag // 4))
         self._poses = np.zeros((256, 3))
         self._steps = np.zeros((256, 4))
+        self._turned = np.zeros((256, 2))  # by odometry alone: heading, and its variance
         self._loops = Loops(
             0,
             np.zeros((256, 2), dtype=np.int64),
@@ -173,7 +175,11 @@ class SequenceSlam:
         self._steps = grown(self._steps, whisk + 1)
         self._poses[whisk] = self._poses[whisk - 1] if whisk else 0.0
         reckon(self._poses[whisk], distance, turn)
-        self._steps[whisk] = distance, turn, *self.config.odometer.sigmas(distance, turn)
+        sigmas = self.config.odometer.sigmas(distance, turn)
+        self._steps[whisk] = distance, turn, *sigmas
+        self._turned = grown(self._turned, whisk + 1)
+        before = self._turned[whisk - 1] if whisk else np.zeros(2)
+        self._turned[whisk] = before[0] + turn, before[1] + sigmas[1] * sigmas[1]
         loops = self._loops
         loops.label = grown(loops.label, whisk + 1)
         loops.label[whisk] = whisk
@@ -192,7 +198,7 @@ class SequenceSlam:
             return -1
         self._belief = self._filter.forward(self._belief, mask, memory.remembered, memory.table)
         self._undecided.append(self._belief)
-        found = self._find(self._belief.known, self._loops)
+        found = self._find(whisk, self._belief.known, self._loops)
         match = int(memory.whisk[found[0, 0]]) if len(found) else -1
         if len(self._undecided) > config.lag:
             self._decide(whisk - config.lag)
@@ -202,7 +208,7 @@ class SequenceSlam:
         """Decide the oldest undecided whisks, of which `first` is the first."""
         before = self._loops.count
         for k, posterior in enumerate(self._filter.smooth(self._undecided, self._at_once)):
-            found = self._find(posterior, self._loops)
+            found = self._find(first + k, posterior, self._loops)
             if len(found):
                 self._loops.add(first + k, found, self._memory.whisk)
         del self._undecided[: self._at_once]
@@ -212,7 +218,7 @@ class SequenceSlam:
             ends, facing = self._ordered(self._loops)
             refine(self._poses[:n], oldest, self._steps[1:n], ends, facing, self._graph)
 
-    def _find(self, posterior: Floats, loops: Loops) -> NDArray[np.int32]:
+    def _find(self, whisk: int, posterior: Floats, loops: Loops) -> NDArray[np.int32]:
         count = find_members(
             posterior,
             posterior.shape[1],
@@ -224,7 +230,19 @@ class SequenceSlam:
             self.config.share,
             self._members,
         )
+        if count and not self._can_face(whisk, *self._members[0]):
+            count = 0
         return self._members[:count]
+
+    def _can_face(self, whisk: int, state: int, direction: int) -> bool:
+        """Whether odometry lets a whisk have the heading of the one it repeats.
+
+        Odometry alone and not the estimate, which is surer of itself than it should be.
+        """
+        turn, variance = self._turned[whisk] - self._turned[self._memory.whisk[state]]
+        apart = wrap_pi(float(turn) - math.pi * int(direction))
+        heading = self.config.loop_heading
+        return apart * apart <= self.config.gate**2 * (float(variance) + heading * heading)
 
     def _forget(self) -> None:
         """Make room in the memory; what is forgotten counts as new from now on."""
@@ -246,16 +264,14 @@ class SequenceSlam:
             for k, posterior in enumerate(
                 self._filter.smooth(self._undecided, len(self._undecided))
             ):
-                found = self._find(posterior, loops)
+                found = self._find(first + k, posterior, loops)
                 if len(found):
                     loops.add(first + k, found, self._memory.whisk)
-        poses = self._poses[:n].copy()
+        poses = np.zeros((0, 3))
         ends, facing = self._ordered(loops)
-        steps = self._steps[1:n]
-        turns = np.empty(len(ends))
         if n:
-            start_values(poses, 0, steps, ends, facing, self._graph.loop_heading, turns)
-            poses = optimise(Graph(steps, ends, turns), poses, self._graph).poses
+            first, steps = self._poses[0], self._steps[1:n]
+            poses = solve_unwound(first, steps, ends, facing, self._graph).poses
         for pose in poses:
             pose[2] = wrap_pi(float(pose[2]))
         chain = np.stack([np.arange(n - 1), np.arange(1, n)], axis=1) if n else ends
@@ -270,7 +286,7 @@ class SequenceSlam:
         states = np.clip(np.arange(n) - self.config.gap + 1, 0, memory.capacity)
         masks = memory.kinds[memory.kind_of]
         for whisk, posterior in enumerate(self._filter.smooth_run(masks, states)):
-            found = self._find(posterior, loops)
+            found = self._find(whisk, posterior, loops)
             if len(found):
                 loops.add(whisk, found, memory.whisk)
 

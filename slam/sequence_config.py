@@ -30,6 +30,7 @@ class SequenceConfig:
     reach: how far apart the places of a group may be, whisks.
     share: least probability of a member that gets a loop, relative to the best.
     most_loops: members of a group that get a loop, at most.
+    gate: standard deviations by which a loop's heading may differ from what odometry says.
     memory: whisks remembered; when full, half of them are forgotten (see sequence_memory).
     window: whisks whose poses are estimated anew with every loop; older ones change in the map
         alone.
@@ -53,6 +54,7 @@ class SequenceConfig:
     reach: int = 4
     share: float = 0.1
     most_loops: int = 16
+    gate: float = 4.0
     memory: int = 8192
     window: int = 400
     lateral: float = 0.0015
@@ -100,6 +102,7 @@ _RANGES: Final[dict[str, tuple[float, float]]] = {
     "reach": (0, 1000),
     "share": (1e-6, 1.0),
     "most_loops": (1, 64),
+    "gate": (0.1, 1e6),
     "memory": (64, 1_000_000),
     "window": (2, 100_000),
     "lateral": (1e-6, 10.0),

@@ -79,7 +79,8 @@ def started(
     steps: np.ndarray, loops: np.ndarray, facing: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     poses, turns = np.zeros((len(steps) + 1, 3)), np.empty(len(loops))
-    start_values(poses, 0, steps, loops, facing, PARAMS.loop_heading, turns)
+    nearest, surprise = np.zeros(len(loops), dtype=np.bool_), np.empty(len(loops))
+    start_values(poses, 0, steps, loops, facing, PARAMS.loop_heading, nearest, turns, surprise)
     return poses, turns
 
 
