@@ -98,7 +98,14 @@ PROCESSES: Final[dict[str, Process]] = {
         Process(
             "arm",
             "vibrissa.processes.arm:ArmNode",
-            hears=("rig.arm", "whisk.calibration", "run.order", "run.event", "rig.event", "host.event"),
+            hears=(
+                "rig.arm",
+                "whisk.calibration",
+                "run.order",
+                "run.event",
+                "rig.event",
+                "host.event",
+            ),
             says=("arm.state", "arm.setpoint", "node.answer", "node.event"),
             pacing="arrival",
             priority=40,
