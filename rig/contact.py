@@ -179,9 +179,11 @@ def across_edge(
     that plane, gamma > 0 for an edge outside. Across the edge the shaft looks w times as long.
     """
     x, z = sin_phi * slope, cos_phi
-    w = max(math.sqrt(x * x + z * z), 1e-9)
-    along, off = (distance * x + drop * z) / (w * w), (distance * z - drop * x) / w
-    return math.sqrt(along * along + off * off), atan2(off, along), w
+    square = max(x * x + z * z, 1e-18)
+    w = math.sqrt(square)
+    along, off = distance * x + drop * z, distance * z - drop * x
+    reach = math.sqrt(along * along + off * off * square) / square
+    return reach, atan2(off * w, along), w
 
 
 @compiled
@@ -221,7 +223,8 @@ def from_above(
         arm = min(max(reach, LEAST_ARM * length), length)
         moment, arc, angle, rests = peg(form, tables, 1.0 - taper * arm, max(gamma, 0.0))
         edge_angle = atan2(far, drop)
-        edge_y, edge_x = moment / arm * slope / w, moment / arm * left * cos_phi / w
+        push = moment / (arm * w)
+        edge_y, edge_x = push * slope, push * left * cos_phi
         held = rests and arc * arm <= length
         if held and not on_face and phi + angle < 0.5 * math.pi:
             return ON_EDGE, edge_angle, edge_y, edge_x
@@ -299,8 +302,8 @@ def from_inside(
             moment, arc, angle, rests = peg(form, tables, 1.0 - taper * arm, -gamma)
             if rests and arc * arm <= length:
                 edge_holds, edge_angle = True, atan2(near, drop)
-                edge_y = -moment / arm * slope / w
-                edge_x = -moment / arm * left * cos_phi / w
+                push = moment / (arm * w)
+                edge_y, edge_x = -push * slope, -push * left * cos_phi
                 dip = toward * cos(angle) - cos_phi / w * sin(angle)
                 through_face = (length - arc * arm) * max(dip, 0.0)
     if tip_holds and not (edge_holds and through_edge > 0.0):

@@ -45,6 +45,7 @@ from vibrissa.rig.rows import (
     MARGIN,
     MOMENT_X,
     MOMENT_Y,
+    NOISE,
     OMEGA,
     PEG,
     PHI,
@@ -75,6 +76,7 @@ from vibrissa.rig.rows import (
     THETA,
     THETA_HIGH,
     THETA_LOW,
+    UNIFORMS,
     WEIGHT,
     at,
 )
@@ -193,8 +195,8 @@ def sense(
     """
     if tick % DRIFT_TICKS == 0:
         drift(state, head, seed, tick)
-    noise, uniforms = np.empty(2 * PAIRS, dtype=np.float64), np.empty(2 * PAIRS, dtype=np.float64)
-    normals(seed, tick, uniforms, noise)
+    noise = memo[at(NOISE, 0) : at(NOISE, 2 * PAIRS)]
+    normals(seed, tick, memo[at(UNIFORMS, 0) : at(UNIFORMS, 2 * PAIRS)], noise)
     for i in range(WHISKERS):
         theta_out[i] = state[at(THETA, i)] + head[at(ENCODER_NOISE, i)] * noise[i]
     for axis in range(2):

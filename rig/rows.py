@@ -107,8 +107,16 @@ STATE_ROWS = 26
     _,
     COS_PHI,
     _,
+    NOISE,  # first of four rows for the normals of this tick ...
+    _,
+    _,
+    _,
+    UNIFORMS,  # ... and of four for what they are made of
+    _,
+    _,
+    _,
     BEFORE,  # first of the rows that keep the contact's state of before an evaluation
-) = range(18)
+) = range(26)
 CONTACT_ROWS = HELD_Y + 1 - PSI
 MEMO_ROWS = BEFORE + CONTACT_ROWS
 

@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from vibrissa.compilation import inlined
 from vibrissa.numerics import atan2, compiled, cos, sin
 from vibrissa.rig.beam import peg, tip
 from vibrissa.rig.contact import (
@@ -74,7 +75,7 @@ def clear_of(length: float, angle: float, drop: float) -> bool:
     return length * (1.0 - square * (0.5 - square / 24.0)) < drop
 
 
-@compiled
+@inlined
 def touch(
     state: NDArray[np.float64],
     i: int,
