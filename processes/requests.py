@@ -219,7 +219,7 @@ class Requests:
         """Swap what moves nothing by itself: the node concerned does it between two cycles."""
         if node == "arm" and parameters:
             raise RunError("swap: circuits of the arm have no parameters")
-        target, what = name, name
+        target, what = name, "circuits"
         if node == "slam":
             target = yield from self._loaded(self._slams, name, parameters)
             what = f"{self._slams.slots.get(target, target)} ({target})"
@@ -346,15 +346,15 @@ class Requests:
 
     def _handed_over(self, number: int, slot: str) -> Generator[None, None, None]:
         """Until a newcomer has taken what was seen so far, sent again while it does not hear it."""
+        numbers = [number]
         for _ in range(HAND_OVERS):
             until = self._run.tick + PATIENCE_TICKS
-            while not self._answers.get(number) and self._run.tick < until:
+            while self._run.tick < until:
+                if any(self._answers.get(n) for n in numbers):  # a busy one may take its time
+                    return
                 yield
-            if self._answers.get(number):
-                return
-            again = self._order("register", self._slams.arbiter, slot)
-            yield from self._obeyed(again)
-            number = again
+            numbers.append(self._order("register", self._slams.arbiter, slot))
+            yield from self._obeyed(numbers[-1])
         raise RunError("it did not take what was seen so far")
 
     def _obeyed(self, number: int) -> Generator[None, None, None]:

@@ -56,7 +56,8 @@ class Others:
             refusal = self._forget(name)
             text = f"{name} is forgotten"
         elif order.kind == "swap":
-            at = max(order.at, (tick // self._period + 1) * self._period)
+            seen = self._seen[-1][0] if self._seen else -1
+            at = max(order.at, (max(tick // self._period, seen) + 1) * self._period)
             refusal = self._objection(name)
             text = f"is the run's SLAM from cycle {at // self._period} on, after {self.owner}"
             outputs = [] if refusal else [self._owned(at, name)]

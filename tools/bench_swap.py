@@ -63,7 +63,8 @@ def bench(out: Path, duration: float, on_progress: OnProgress, swaps: int = SWAP
         summary = supervisor.run()
     operator.join()
     if operator.error is not None:
-        raise RunError(f"the run could not be swapped in: {operator.error}")
+        why = f"{operator.error}; it ended with: {summary['cause']}"
+        raise RunError(f"the run could not be swapped in: {why}")
     on_progress(Progress("reading the log", 0.0, 0.0))
     found = read(folder / "run.mcap", operator.first_tick, experiment)
     verdicts = {how: verify(folder / "run.mcap", how, on_progress) for how in ("fused", "lockstep")}
@@ -105,7 +106,11 @@ def bench(out: Path, duration: float, on_progress: OnProgress, swaps: int = SWAP
 
 
 class Operator(threading.Thread):
-    """Swaps two controllers back and forth in a live run, then ends it."""
+    """Swaps two controllers back and forth in a live run, then ends it.
+
+    A refusal (the newcomer is late on a busy machine, its whiskers are elsewhere) is counted and
+    asked again; the run itself goes on whatever is refused.
+    """
 
     def __init__(
         self,
