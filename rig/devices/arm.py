@@ -31,8 +31,8 @@ from vibrissa.rig.devices.errors import (
 from vibrissa.rig.devices.limits import ARM, ArmLimits, Follower, Pose
 
 TICK_NS: Final = 500_000
-ANSWER_S: Final = 3.0
-"""How long the first state may take."""
+ANSWER_S: Final = 10.0
+"""How long the first state may take, the start of a process that listens included."""
 RETRY_NS: Final = 500_000_000
 SILENT_NS: Final = 1_000_000_000
 """Silence after which a connection is given up and made again."""

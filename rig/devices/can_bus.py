@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import select
 import socket
 import struct
@@ -17,6 +18,8 @@ BITRATE, DATA_BITRATE = 1_000_000, 5_000_000
 _EVERYBODY: Final = "127.255.255.255"
 _HEADER = struct.Struct("<I")
 _KEEP: Final = 1 << 22
+_SO_RCVBUFFORCE: Final = 33
+"""Linux: beyond the system's limit, for those who may."""
 
 
 class LoopbackBus(can.BusABC):
@@ -38,7 +41,7 @@ class LoopbackBus(can.BusABC):
         self._out.bind(("127.0.0.1", 0))
         self._me = self._out.getsockname()
         self._in.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        self._in.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _KEEP)
+        _keep_more(self._in.fileno())
         self._in.bind(self._to)
         self._in.setblocking(False)
 
@@ -64,6 +67,14 @@ class LoopbackBus(can.BusABC):
         super().shutdown()
         self._in.close()
         self._out.close()
+
+
+def _keep_more(descriptor: int) -> None:
+    """Let the kernel hold more datagrams for a reader that is kept from running."""
+    with socket.socket(fileno=os.dup(descriptor)) as same:
+        same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _KEEP)  # the system's limit counts
+        with contextlib.suppress(OSError):
+            same.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _KEEP)
 
 
 def _message(identifier: int, data: bytes) -> can.Message:
@@ -99,7 +110,10 @@ def open_bus(name: str, interface: str, channel: str) -> can.BusABC:
             raise DeviceUnavailable(f"{name}: can't be opened: {error.strerror}") from None
     options: dict[str, Any] = {"udp_multicast": {"hop_limit": 0}}.get(interface, {})
     try:
-        return can.Bus(interface=interface, channel=channel, fd=True, **options)
+        bus = can.Bus(interface=interface, channel=channel, fd=True, **options)
+        if interface == "udp_multicast":
+            _keep_more(bus.fileno())
+        return bus
     except (can.CanError, OSError, ValueError, NotImplementedError) as error:
         text = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise DeviceUnavailable(f"{name}: can't be opened: {text}") from None
