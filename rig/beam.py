@@ -32,7 +32,7 @@ from vibrissa.rig.beam_table import (
 FORMS = ("linear", "table", "exact")
 LINEAR, TABLE, EXACT = range(3)
 EXACT_STEPS = elastica.STEPS
-LEAST_HEIGHT, MOST_HEIGHT = math.cos(MOST_FIRST), math.cos(LEAST_FIRST)
+LEAST_HEIGHT, MOST_HEIGHT = cos(MOST_FIRST), cos(LEAST_FIRST)
 
 
 def beam_tables(ratios: tuple[float, ...], size: int) -> NDArray[np.float64]:

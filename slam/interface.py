@@ -46,7 +46,7 @@ class SlamStep:
     difference to the matched template (0 to 1), infinite when no template was comparable.
     `action`: 0 none, 1 an experience was created, 2 a known experience was entered.
     `x`, `y` (m) and `heading` (rad): current pose in the map frame.
-    `pc_x`, `pc_y`, `pc_th`: the pose cells' packet, in cells.
+    `pc_x`, `pc_y`, `pc_th`: the pose cells' packet, in cells; 0 where there are none.
     `experiences`, `templates`: how many exist after the step.
     """
 
