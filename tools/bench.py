@@ -89,6 +89,7 @@ BENCHES: Final[dict[str, str]] = {
     "slam": "vibrissa.tools.bench_slam:bench",
     "slam-stress": "vibrissa.tools.bench_slam_stress:bench",
     "experiment": "vibrissa.tools.bench_experiment:bench",
+    "touch": "vibrissa.tools.bench_touch:bench",
 }
 """name -> where its function is, imported when it is asked for."""
 

@@ -14,7 +14,9 @@ SHOWN = ("arr", "em_experience_interval")
 
 
 def experiment(
-    name: Annotated[str, typer.Argument(help="Only `paper`: Salman and Pearson's experiment.")],
+    name: Annotated[
+        str, typer.Argument(help="`paper`: Salman and Pearson's experiment; `slam`: SLAM by touch.")
+    ],
     seeds: Annotated[int, typer.Option(min=1, max=1000, help="Runs of the whole.")] = 5,
     jobs: Annotated[int, typer.Option(min=0, help="Processes; 0: one per core.")] = 0,
     out: Annotated[
@@ -29,8 +31,11 @@ def experiment(
 
     An interrupted run goes on where it stopped; what is in the cache is not run again.
     """
-    if name != "paper":
-        raise typer.BadParameter(f"no experiment {name!r}; there is `paper`")
+    if name not in ("paper", "slam"):
+        raise typer.BadParameter(f"no experiment {name!r}; there are `paper` and `slam`")
+    if name == "slam":
+        _slam(seeds, quick, jobs or len(os.sched_getaffinity(0)), out, as_json)
+        return
     from vibrissa.tools.experiment.design import NOISE, scale
     from vibrissa.tools.experiment.paper import run_paper
 
@@ -46,6 +51,22 @@ def experiment(
                 f"({row['up']} up, {row['down']} down of {row['n']}): {row['reading']}"
             )
     console.print(f"{out / 'report.html'}  {results['timing']['wall_s']:.0f} s")
+
+
+def _slam(seeds: int, quick: bool, jobs: int, out: Path, as_json: bool) -> None:
+    from vibrissa.tools.experiment.scores import RELATIONS
+    from vibrissa.tools.experiment.slam_report import SHOWN, run_slam
+
+    results = run_slam(seeds, quick, jobs, out)
+    if as_json:
+        print_json(results)
+        return
+    console = stdout()
+    for cell in results["table"]:
+        if cell["group"] == "plain" and cell["row"] in SHOWN:
+            found = [f"{cell[r]['ratio']:.3g} ({cell[r]['wins']})" for r in RELATIONS]
+            console.print(f"{cell['row']}, {cell['noise']}: {', '.join(found)} of {cell['n']}")
+    console.print(str(out / "report.html"))
 
 
 VERBS = ((experiment, "vibrissa experiment paper --quick --out runs/quick"),)

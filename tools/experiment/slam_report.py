@@ -1,0 +1,143 @@
+"""`vibrissa experiment slam` from start to report: run what the cache lacks, tabulate, write."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from vibrissa.tools.console import note, write_json
+from vibrissa.tools.experiment.report import STYLE, grid, number, picture
+from vibrissa.tools.experiment.scores import RELATIONS
+from vibrissa.tools.experiment.slam_runs import NOISES, ROWS, run_work, works
+from vibrissa.tools.experiment.statistics import geometric_mean, summarise
+from vibrissa.tools.experiment.tasks import recorded, rig_key
+from vibrissa.tools.machine import machine
+
+WON: Final = 0.999
+"""Ratio below which a run is won; dead reckoning itself is at 1 up to rounding."""
+SHOWN: Final = ("sequence, batch", "sequence, lag 100", "sequence, past only")
+
+
+def run_slam(seeds: int, quick: bool, jobs: int, out: Path) -> dict[str, Any]:
+    """Run, write results.json and report.html into `out`; the results."""
+    folder = out / "cache"
+    folder.mkdir(parents=True, exist_ok=True)
+    wanted = works(seeds, quick)
+    rigs = {rig_key(work.rig): work.rig for work in wanted}
+    runs: list[dict[str, Any]] = []
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(jobs, context, initializer=_prepare) as pool:
+        making = [pool.submit(_make, folder, rig) for rig in rigs.values()]
+        for k, done in enumerate(as_completed(making)):
+            done.result()
+            note(f"data set {k + 1} of {len(making)}")
+        running = [pool.submit(run_work, folder, work) for work in wanted]
+        for k, finished in enumerate(running):
+            runs += finished.result()
+            note(f"maps {k + 1} of {len(running)}")
+    results = {"table": tabulate(runs), "runs": runs, "machine": machine(), "seeds": seeds}
+    write_json(out / "results.json", results)
+    (out / "report.html").write_text(page(results))
+    return results
+
+
+def _prepare() -> None:
+    os.nice(5)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _make(folder: Path, rig: Any) -> None:
+    recorded(folder, rig)
+
+
+def tabulate(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Per group, row and noise: geometric mean, interval of it, worst run and wins by relations."""
+    found = []
+    groups = list(dict.fromkeys(run["group"] for run in runs))
+    for group in groups:
+        for row in ROWS:
+            for noise in NOISES:
+                chosen = [
+                    run
+                    for run in runs
+                    if (run["group"], run["row"], run["noise"]) == (group, row.name, noise)
+                ]
+                if not chosen:
+                    continue
+                cell: dict[str, Any] = {"group": group, "row": row.name, "noise": noise}
+                cell["n"] = len(chosen)
+                cell["loops"] = float(np.mean([run["loops"] for run in chosen]))
+                right = [run["right"] for run in chosen if run["right"] is not None]
+                cell["right"] = float(np.mean(right)) if right else None
+                for relations in RELATIONS:
+                    ratios = [run[relations] for run in chosen]
+                    logs = summarise(np.log(ratios))
+                    cell[relations] = {
+                        "ratio": geometric_mean(ratios),
+                        "low": float(np.exp(logs.low)),
+                        "high": float(np.exp(logs.high)),
+                        "worst": max(ratios),
+                        "wins": sum(ratio < WON for ratio in ratios),
+                    }
+                found.append(cell)
+    return found
+
+
+def front(table: Sequence[dict[str, Any]]) -> Figure:
+    """Ratios of the plain data sets by row, one panel per relation set."""
+    figure = Figure(figsize=(11.0, 3.6), layout="constrained")
+    names = [row.name for row in ROWS]
+    for k, relations in enumerate(RELATIONS):
+        ax = figure.add_subplot(1, len(RELATIONS), k + 1)
+        for shift, noise in enumerate(NOISES):
+            cells = [c for c in table if c["group"] == "plain" and c["noise"] == noise]
+            values = [c[relations] for c in cells]
+            middle = np.array([v["ratio"] for v in values])
+            span = np.abs(np.array([[v["low"], v["high"]] for v in values]).T - middle)
+            at = np.array([names.index(c["row"]) for c in cells]) + 0.2 * (shift - 1)
+            ax.errorbar(middle, at, xerr=span, fmt="o", ms=3, lw=1, label=noise)
+        ax.axvline(1.0, color="0.6", lw=0.8)
+        ax.set_xscale("log")
+        ax.set_title(relations)
+        ax.set_yticks(range(len(names)), names if k == 0 else [""] * len(names), fontsize=7)
+        ax.invert_yaxis()
+        ax.set_xlabel("EM over odometry's")
+    figure.axes[0].legend(fontsize=7)
+    return figure
+
+
+def page(results: dict[str, Any]) -> str:
+    """The report, one HTML file."""
+    table = results["table"]
+    parts = [picture(front(table))]
+    for group in dict.fromkeys(cell["group"] for cell in table):
+        rows = []
+        for cell in (c for c in table if c["group"] == group):
+            row = [cell["row"], cell["noise"]]
+            for relations in RELATIONS:
+                value = cell[relations]
+                row.append(
+                    f"{number(value['ratio'])} [{number(value['low'])}, {number(value['high'])}]"
+                )
+                row += [number(value["worst"]), f"{value['wins']} / {cell['n']}"]
+            rows.append([*row, number(cell["loops"]), number(cell["right"])])
+        head = ["row", "noise"]
+        for relations in RELATIONS:
+            head += [relations, "worst", "wins"]
+        parts.append(f"<h2>{group}</h2>" + grid([*head, "loops", "right"], rows, 2))
+    return (
+        "<!doctype html><html lang=en><meta charset=utf-8><title>vibrissa: SLAM by touch</title>"
+        f"<style>{STYLE}</style><h1>SLAM by touch against its own odometry</h1><p>Energy Metric of "
+        "the whisks in the final map over that of dead reckoning by the same odometry: geometric "
+        "mean, bootstrap interval over runs, worst run, runs won. Maze draws differ by run. "
+        "Blind: all images zero; shuffled: whole whisks in random order.</p>"
+        f"{''.join(parts)}</html>\n"
+    )
