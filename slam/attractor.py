@@ -109,6 +109,7 @@ def _once(
     line, other = lines[:size], lines[size : 2 * size]
     least, sums = lines[2 * size : 3 * size], lines[3 * size : 4 * size]
 
+    places = np.empty(7, dtype=np.int64)
     length = box[HEADING, LENGTH]
     alive = np.zeros(layers, dtype=np.uint8)
     for b in range(length):
@@ -129,7 +130,7 @@ def _once(
     for e in range(min(layers, length + 2 * reach)):
         out = excited[e * size + even : e * size + last]
         at = wrapped(e - reach, layers)
-        raised[e] = _blur_heading(out, blurred, even, size, at, alive, nothing, excite)
+        raised[e] = _blur_heading(out, blurred, even, size, at, alive, nothing, excite, places)
 
     # a cell keeps what exceeds the global inhibition; in margins nothing does
     sums[:] = 0.0
@@ -150,7 +151,7 @@ def _once(
         # without negative activity inhibition only lowers: little is already nothing
         if enough == 0 and not faithful:
             continue
-        _blur_heading(line[even:last], excited, even, size, e, raised, nothing, inhibit)
+        _blur_heading(line[even:last], excited, even, size, e, raised, nothing, inhibit, places)
         close(line, height, width, margin, inhibit.shape[0] - 1, n)
         blur_line(other[first:end], line, first, stride, inhibit)
         blur_line(result[e * size + first : e * size + end], other, first, 1, inhibit)
@@ -180,10 +181,13 @@ def _blur_heading(
     alive: Bytes,
     nothing: int,
     weights: Floats,
+    places: Ints,
 ) -> bool:
-    """The layer `at` of the circular convolution of the alive layers along heading, if any."""
+    """The layer `at` of the circular convolution of the alive layers along heading, if any.
+
+    places: room for seven numbers.
+    """
     layers = alive.shape[0]
-    places = np.empty(7, dtype=np.int64)
     radius = weights.shape[0] - 1
     reached = False
     for t in range(-radius, radius + 1):

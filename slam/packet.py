@@ -112,7 +112,11 @@ def close_columns(layer: Floats, height: int, width: int, margin: int, radius: i
     stride = width + 2 * margin
     for j in range(margin, margin + height):
         start = j * stride + margin
-        if width == n:
+        if width == n and n >= radius:
+            for t in range(1, radius + 1):
+                layer[start - t] = layer[start + n - t]
+                layer[start + n - 1 + t] = layer[start + t - 1]
+        elif width == n:
             for t in range(1, radius + 1):
                 layer[start - t] = layer[start + wrapped(-t, n)]
                 layer[start + n - 1 + t] = layer[start + wrapped(t - 1, n)]

@@ -26,8 +26,8 @@ from vibrissa.slam.packet import (
     SPARE,
     START,
     STATE,
-    close,
     close_columns,
+    close_rows,
     grow,
     layer_size,
     memory_of,
@@ -123,6 +123,7 @@ def integrate(
     motion_table.
     """
     layers, length = box[HEADING, EXTENT], box[HEADING, LENGTH]
+    height, width = box[ROW, EXTENT], box[COLUMN, EXTENT]
     size = layer_size(box, margin)
     moved = work[BLURRED]
     back_j, on_j, back_i, on_i = 0, 0, 0, 0
@@ -131,7 +132,9 @@ def integrate(
         if not kept[k]:
             continue
         layer = work[SPARE, wrapped(offset + b, layers) * size :]
-        close(layer, box[ROW, EXTENT], box[COLUMN, EXTENT], margin, 2, n)
+        if width == n:
+            close_columns(layer, height, width, margin, 1, n)
+        close_rows(layer, height, width + 2 * margin, margin, 2, n)
         _move_layer(moved[b * size :], layer, box, motion[k], speed, margin, n, faithful)
         quarter = int(motion[k, 2])
         back_j = max(back_j, -UP_J[quarter], -RIGHT_J[quarter])
