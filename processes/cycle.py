@@ -47,7 +47,7 @@ from vibrissa.rig.plant import (
     head_model,
     rest_state,
 )
-from vibrissa.rig.rows import GAMMA
+from vibrissa.rig.rows import GAMMA, at
 from vibrissa.rig.scene import wall_boxes
 
 Float32s = NDArray[np.float32]
@@ -150,8 +150,8 @@ class WhiskLoop:
             self._plant = HeadPlant(run.boxes, run.seed, run.head)
         else:
             self._model = head_model(run.boxes, run.head)
-            self._state = rest_state(run.head)
-            self._memo = fresh_memo()
+            self._state = rest_state(run.head).reshape(-1)
+            self._memo = fresh_memo().reshape(-1)
 
     def cycles(self) -> Iterator[Cycle]:
         """Run from tick 0 to the end.
@@ -332,28 +332,27 @@ def _whisk(
     last float32[18]: what the drives were given; active bool[1]: whether the controller has them;
     signals float32[5, >= ticks, 18]: theta, x, y, applied, command.
     """
-    whiskers = last.shape[0]
     pose = np.empty(4, dtype=np.float64)
-    held = np.empty(whiskers, dtype=np.float64)
-    given = np.empty(whiskers, dtype=np.float32)
+    held = np.empty(WHISKERS, dtype=np.float64)
+    given = np.empty(WHISKERS, dtype=np.float32)
     for j in range(ticks):
         tick = first + j
         k = tick // ARM_PERIOD - first // ARM_PERIOD
         part = (tick % ARM_PERIOD) / ARM_PERIOD
         for a in range(4):
             pose[a] = poses[k, a] + (poses[k + 1, a] - poses[k, a]) * part
-        for i in range(whiskers):
-            held[i] = state[GAMMA, i]
+        for i in range(WHISKERS):
+            held[i] = state[at(GAMMA, i)]
         theta, x, y = signals[SAMPLED_THETA, j], signals[SAMPLED_X, j], signals[SAMPLED_Y, j]
+        applied = signals[APPLIED, j]
         status = head_step(state, memo, model, True, seed, tick, pose, last, tick == 0, theta, x, y)
         if status != OK:
             return status
-        for i in range(whiskers):
-            gamma = state[GAMMA, i]
+        for i in range(WHISKERS):
+            gamma = state[at(GAMMA, i)]
             deepest[i] = max(deepest[i], abs(gamma))
-            if held[i] - gamma > SLIP:
-                slips[i] += 1
-            signals[APPLIED, j, i] = last[i]
+            slips[i] += 1 if held[i] - gamma > SLIP else 0
+            applied[i] = last[i]
 
         command = signals[COMMANDED, j]
         if law == OPEN_LOOP:

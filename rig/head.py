@@ -47,6 +47,7 @@ from vibrissa.rig.rows import (
     MOMENT_Y,
     NOISE,
     OMEGA,
+    PASSED,
     PEG,
     PHI,
     PHI_START,
@@ -94,7 +95,10 @@ POSE_LIMIT = 1e4
 
 
 class HeadModel(NamedTuple):
-    """What does not change in a run: head, beam tables and the arrays of the scene."""
+    """What does not change in a run: head, beam tables and the arrays of the scene.
+
+    head: float64[HEAD_ROWS * 18], see `at`.
+    """
 
     head: NDArray[np.float64]
     beam: NDArray[np.float64]
@@ -114,7 +118,7 @@ def drive(
 ) -> None:
     """Advance every servo by one tick; fills in ACCELERATION and PHI .. COS_PHI of the memo.
 
-    state, memo and head as one row each, see `at`.
+    state, memo and head: float64[rows * 18], see `at`.
     """
     for i in range(WHISKERS):
         low, high = head[at(THETA_LOW, i)], head[at(THETA_HIGH, i)]
@@ -214,6 +218,43 @@ def sense(
 
 
 @compiled
+def pass_over(
+    state: NDArray[np.float64],
+    memo: NDArray[np.float64],
+    head: NDArray[np.float64],
+    pose: NDArray[np.float64],
+    top: float,
+    still: bool,
+) -> None:
+    """Find the whiskers whose contact needs no look, and advance them: PASSED of the memo is 1.
+
+    Those are: free and with room to where they are now, or above all walls, or above the floor and
+    away from walls; and held as in the tick before, from which nothing has changed. top: of the
+    highest wall, m; still: whether the head stands. Other arguments as for `drive`.
+    """
+    for i in range(WHISKERS):
+        phi, psi, length = memo[at(PHI, i)], state[at(PSI, i)], head[at(LENGTH, i)]
+        from_phi = memo[at(FROM_PHI, i)]
+        moved = (
+            abs(pose[0] - memo[at(FROM_X, i)])
+            + abs(pose[1] - memo[at(FROM_Y, i)])
+            + abs(pose[3] - memo[at(FROM_YAW, i)]) * (head[at(PIVOT_RADIUS, i)] + length)
+        )
+        turned = max(abs(phi - from_phi), abs(psi - from_phi))
+        reached = moved + abs(pose[2] - memo[at(FROM_Z, i)]) + turned * length
+        pz = max(pose[2] + head[at(PIVOT_HEIGHT, i)], LEAST_DROP)
+        drop = pz if moved < memo[at(MARGIN, i)] else max(pz - top, LEAST_DROP)
+        clear = clear_of(length, min(abs(psi), abs(phi)), drop)
+        free = (state[at(PEG, i)] < 0.0) & (state[at(SIDE, i)] == 0.0)
+        flies = free & (clear | (reached < memo[at(ROOM, i)]))
+        settled, settled_phi = memo[at(SETTLED, i)], memo[at(SETTLED_PHI, i)]
+        rests = still & (settled > 0.0) & (settled_phi == phi)
+        state[at(PSI, i)] = phi if flies else psi
+        memo[at(SETTLED, i)] = 0.0 if flies else settled
+        memo[at(PASSED, i)] = 1.0 if flies | rests else 0.0
+
+
+@compiled
 def head_step(
     state: NDArray[np.float64],
     memo: NDArray[np.float64],
@@ -230,10 +271,10 @@ def head_step(
 ) -> int:
     """Advance all whiskers by one tick and sample them.
 
-    state float64[STATE_ROWS, 18] and memo float64[MEMO_ROWS, 18], changed in place; a memo belongs
-    to one state and one model, and a fresh one of zeros may replace it at any time; pose
-    float64[4]: x, y, z (m) and yaw (rad) of the head; command float32[18]: theta set-points, rad;
-    silent: the watchdog has fired, the drives go back to theta = 0 by themselves. Results
+    state float64[STATE_ROWS * 18] and memo float64[MEMO_ROWS * 18], changed in place, see `at`; a
+    memo belongs to one state and one model, and a fresh one of zeros may replace it at any time;
+    pose float64[4]: x, y, z (m) and yaw (rad) of the head; command float32[18]: theta set-points,
+    rad; silent: the watchdog has fired, the drives go back to theta = 0 by themselves. Results
     float32[18]: theta rad, x and y N m.
     Returns OK, or COMMAND_NOT_FINITE or POSE_OUT_OF_RANGE with nothing changed.
     """
@@ -241,48 +282,31 @@ def head_step(
     for k in range(4):
         if not abs(pose[k]) <= POSE_LIMIT:
             return POSE_OUT_OF_RANGE
-    if not silent:
-        for i in range(WHISKERS):
-            if not math.isfinite(command[i]):
-                return COMMAND_NOT_FINITE
-    flat_state, flat_memo, flat_head = state.reshape(-1), memo.reshape(-1), head.reshape(-1)
-    drive(flat_state, flat_memo, flat_head, command, silent)
+    bad = 0
+    for i in range(WHISKERS):
+        bad += 0 if math.isfinite(command[i]) else 1
+    if bad > 0 and not silent:
+        return COMMAND_NOT_FINITE
+    drive(state, memo, head, command, silent)
     cos_yaw, sin_yaw = cos(pose[3]), sin(pose[3])
     still = True
     for k in range(4):
-        still = still and memo[POSE, k] == pose[k]
-        memo[POSE, k] = pose[k]
-    top = grid[GRID_TOP]
+        still = still and memo[at(POSE, k)] == pose[k]
+        memo[at(POSE, k)] = pose[k]
+    if skip:
+        pass_over(state, memo, head, pose, grid[GRID_TOP], still)
     for i in range(WHISKERS):
-        phi = memo[PHI, i]
-        length = head[LENGTH, i]
-        pz = max(pose[2] + head[PIVOT_HEIGHT, i], LEAST_DROP)
-        free = state[PEG, i] < 0.0 and state[SIDE, i] == 0.0
-        if skip:
-            if free:
-                angle = min(abs(state[PSI, i]), abs(phi))
-                moved = (
-                    abs(pose[0] - memo[FROM_X, i])
-                    + abs(pose[1] - memo[FROM_Y, i])
-                    + abs(pose[3] - memo[FROM_YAW, i]) * (head[PIVOT_RADIUS, i] + length)
-                )
-                turned = max(abs(phi - memo[FROM_PHI, i]), abs(state[PSI, i] - memo[FROM_PHI, i]))
-                beside = moved + abs(pose[2] - memo[FROM_Z, i]) + turned * length < memo[ROOM, i]
-                away = moved < memo[MARGIN, i]
-                drop = pz if away else max(pz - top, LEAST_DROP)
-                if beside or clear_of(length, angle, drop):
-                    state[PSI, i] = phi
-                    memo[SETTLED, i] = 0.0
-                    continue
-            if still and memo[SETTLED, i] > 0.0 and memo[SETTLED_PHI, i] == phi:
-                continue
-        ux = cos_yaw * head[AZIMUTH_COS, i] - sin_yaw * head[AZIMUTH_SIN, i]
-        uy = sin_yaw * head[AZIMUTH_COS, i] + cos_yaw * head[AZIMUTH_SIN, i]
-        px = pose[0] + head[PIVOT_RADIUS, i] * ux
-        py = pose[1] + head[PIVOT_RADIUS, i] * uy
+        if skip and memo[at(PASSED, i)] > 0.0:
+            continue
+        phi = memo[at(PHI, i)]
+        pz = max(pose[2] + head[at(PIVOT_HEIGHT, i)], LEAST_DROP)
+        ux = cos_yaw * head[at(AZIMUTH_COS, i)] - sin_yaw * head[at(AZIMUTH_SIN, i)]
+        uy = sin_yaw * head[at(AZIMUTH_COS, i)] + cos_yaw * head[at(AZIMUTH_SIN, i)]
+        px = pose[0] + head[at(PIVOT_RADIUS, i)] * ux
+        py = pose[1] + head[at(PIVOT_RADIUS, i)] * uy
         if skip and still:
             for k in range(CONTACT_ROWS):
-                memo[BEFORE + k, i] = state[PSI + k, i]
+                memo[at(BEFORE + k, i)] = state[at(PSI + k, i)]
         touch(
             state,
             i,
@@ -299,16 +323,16 @@ def head_step(
             ux,
             uy,
             phi,
-            memo[SIN_PHI, i],
-            memo[COS_PHI, i],
+            memo[at(SIN_PHI, i)],
+            memo[at(COS_PHI, i)],
         )
         if skip:
             settled = still
             if still:
                 for k in range(CONTACT_ROWS):
-                    settled = settled and memo[BEFORE + k, i] == state[PSI + k, i]
-            memo[SETTLED, i], memo[SETTLED_PHI, i] = 1.0 if settled else 0.0, phi
-            if state[PEG, i] < 0.0 and state[SIDE, i] == 0.0:
+                    settled = settled and memo[at(BEFORE + k, i)] == state[at(PSI + k, i)]
+            memo[at(SETTLED, i)], memo[at(SETTLED_PHI, i)] = 1.0 if settled else 0.0, phi
+            if state[at(PEG, i)] < 0.0 and state[at(SIDE, i)] == 0.0:
                 look_around(
                     memo,
                     i,
@@ -324,9 +348,9 @@ def head_step(
                     ux,
                     uy,
                     phi,
-                    memo[SIN_PHI, i],
-                    memo[COS_PHI, i],
+                    memo[at(SIN_PHI, i)],
+                    memo[at(COS_PHI, i)],
                 )
-    vibrate(flat_state, flat_memo, flat_head)
-    sense(flat_state, flat_memo, flat_head, seed, tick, theta_out, x_out, y_out)
+    vibrate(state, memo, head)
+    sense(state, memo, head, seed, tick, theta_out, x_out, y_out)
     return OK

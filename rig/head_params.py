@@ -182,7 +182,8 @@ def head_model(boxes: Float64s, params: HeadPlantParams, table_size: int = SIZE)
     """
     scene = build_scene(boxes, float(params.geometry.length.max()))
     beam = beam_tables(_tip_ratios(params), table_size)
-    return HeadModel(head_table(params), beam, scene.boxes, scene.grid, scene.starts, scene.items)
+    head = head_table(params).reshape(-1)
+    return HeadModel(head, beam, scene.boxes, scene.grid, scene.starts, scene.items)
 
 
 def fresh_memo() -> Float64s:

@@ -67,6 +67,7 @@ class HeadPlant:
         self.skip = skip
         self.state = rest_state(self.params)
         self._memo = fresh_memo()
+        self._state_row, self._memo_row = self.state.reshape(-1), self._memo.reshape(-1)
         self._watchdog = max(1, round(WATCHDOG_SECONDS * self.params.rate))
         self._pose = np.zeros(4, dtype=np.float64)
         self._command = np.zeros(WHISKERS, dtype=np.float32)
@@ -99,8 +100,8 @@ class HeadPlant:
         x = np.empty(WHISKERS, dtype=np.float32)
         y = np.empty(WHISKERS, dtype=np.float32)
         status = h.head_step(
-            self.state,
-            self._memo,
+            self._state_row,
+            self._memo_row,
             self.model,
             self.skip,
             self.seed,

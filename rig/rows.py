@@ -100,6 +100,7 @@ STATE_ROWS = 26
     FROM_PHI,  # ... and the whisker there
     SETTLED,  # 1 where the last evaluation left the state as it was ...
     SETTLED_PHI,  # ... at this angle
+    PASSED,  # 1 where this tick needs no look
     ACCELERATION,  # rad/s^2, of this tick
     PHI,  # rad; each of these three has a row to spare behind it, for loops over whole vectors
     _,
@@ -107,16 +108,16 @@ STATE_ROWS = 26
     _,
     COS_PHI,
     _,
-    NOISE,  # first of four rows for the normals of this tick ...
+    NOISE,  # first of four rows for the noise of this tick ...
     _,
     _,
     _,
-    UNIFORMS,  # ... and of four for what they are made of
+    UNIFORMS,  # ... and of four for what it is made of
     _,
     _,
     _,
     BEFORE,  # first of the rows that keep the contact's state of before an evaluation
-) = range(26)
+) = range(27)
 CONTACT_ROWS = HELD_Y + 1 - PSI
 MEMO_ROWS = BEFORE + CONTACT_ROWS
 

@@ -56,6 +56,7 @@ from vibrissa.rig.rows import (
     TAPER,
     TIP_SLIP,
     TIP_TABLE,
+    at,
 )
 from vibrissa.rig.scene import GRID_REACH, TOP, index_cell
 
@@ -97,16 +98,22 @@ def touch(
 ) -> None:
     """Contact of whisker i: updates PSI .. HELD_Y of its state and starts its vibration.
 
-    (px, py, pz): pivot, m, world; (ux, uy): unit vector of the whisking plane, outward; phi: motor
-    angle from straight down, rad, with sine and cosine. With ``skip`` only boxes the index names
-    are looked at.
+    state and head: float64[rows * 18], see `at`; (px, py, pz): pivot, m, world; (ux, uy): unit
+    vector of the whisking plane, outward; phi: motor angle from straight down, rad, with sine and
+    cosine. With ``skip`` only boxes the index names are looked at.
     """
-    form, table = int(head[FORM, i]), int(head[TIP_TABLE, i])
-    length, taper, rigidity = head[LENGTH, i], head[TAPER, i], head[RIGIDITY, i]
-    chord = length / (1.0 + head[TIP_SLIP, i] * state[BEND, i])  # of the whisker as it is bent
-    psi, gamma, bend = state[PSI, i], state[GAMMA, i], state[BEND, i]
-    peg_box, side_box, side = int(state[PEG, i]), int(state[SIDE_BOX, i]), state[SIDE, i]
-    lean, on_face = state[SIDE_LEAN, i], state[FACE, i] > 0.0
+    form, table = int(head[at(FORM, i)]), int(head[at(TIP_TABLE, i)])
+    length, taper, rigidity = head[at(LENGTH, i)], head[at(TAPER, i)], head[at(RIGIDITY, i)]
+    chord = length / (
+        1.0 + head[at(TIP_SLIP, i)] * state[at(BEND, i)]
+    )  # of the whisker as it is bent
+    psi, gamma, bend = state[at(PSI, i)], state[at(GAMMA, i)], state[at(BEND, i)]
+    peg_box, side_box, side = (
+        int(state[at(PEG, i)]),
+        int(state[at(SIDE_BOX, i)]),
+        state[at(SIDE, i)],
+    )
+    lean, on_face = state[at(SIDE_LEAN, i)], state[at(FACE, i)] > 0.0
     old_peg, old_side_box = peg_box, side_box
     sin_psi, cos_psi, known = 0.0, 0.0, False  # of psi, once it is asked for
     floor = boxes.shape[0]
@@ -301,7 +308,7 @@ def touch(
     moment_x = (moment_x + side_moment) * rigidity
     gamma = psi - phi
 
-    mu = head[FRICTION, i]
+    mu = head[at(FRICTION, i)]
     if mu > 0.0:
         drag = 0.0
         if peg_box >= 0:
@@ -313,33 +320,35 @@ def touch(
             at_x, at_y = px + u * ux, py + u * uy
             arm = max(arm, LEAST_ARM * length)
             if peg_box == old_peg:
-                drag = state[DRAG, i]
-                drag -= ((at_y - state[HELD_Y, i]) * ux - (at_x - state[HELD_X, i]) * uy) / arm
-            state[HELD_X, i], state[HELD_Y, i] = at_x, at_y
+                drag = state[at(DRAG, i)]
+                drag -= (
+                    (at_y - state[at(HELD_Y, i)]) * ux - (at_x - state[at(HELD_X, i)]) * uy
+                ) / arm
+            state[at(HELD_X, i)], state[at(HELD_Y, i)] = at_x, at_y
             stiffness = 3.0 * rigidity * (1.0 - taper * arm) / arm
             most = mu * math.sqrt(moment_y * moment_y + moment_x * moment_x) / stiffness
             drag = min(max(drag, -most), most)
             moment_x += stiffness * drag
-        state[DRAG, i] = drag
+        state[at(DRAG, i)] = drag
 
     if peg_box != old_peg or side_box != old_side_box:
-        share = head[RELEASE, i]
-        freed_x, freed_y = state[MOMENT_X, i] - moment_x, state[MOMENT_Y, i] - moment_y
-        state[RING_X, i] += share * freed_x
-        state[RING_X2, i] += (1.0 - share) * freed_x
-        state[RING_Y, i] += share * freed_y
-        state[RING_Y2, i] += (1.0 - share) * freed_y
-    if gamma * state[GAMMA, i] < 0.0:
+        share = head[at(RELEASE, i)]
+        freed_x, freed_y = state[at(MOMENT_X, i)] - moment_x, state[at(MOMENT_Y, i)] - moment_y
+        state[at(RING_X, i)] += share * freed_x
+        state[at(RING_X2, i)] += (1.0 - share) * freed_x
+        state[at(RING_Y, i)] += share * freed_y
+        state[at(RING_Y2, i)] += (1.0 - share) * freed_y
+    if gamma * state[at(GAMMA, i)] < 0.0:
         bend = 0.0
     if peg_box >= 0 or side != 0.0:
         bend += 0.5 * (turn_square + gamma * gamma - bend)
     else:
         bend = 0.0
-    state[PSI, i], state[GAMMA, i], state[BEND, i] = psi, gamma, bend
-    state[PEG, i], state[SIDE, i], state[SIDE_BOX, i] = peg_box, side, side_box
-    state[FACE, i] = 1.0 if on_face else 0.0
-    state[SIDE_LEAN, i] = lean
-    state[MOMENT_X, i], state[MOMENT_Y, i] = moment_x, moment_y
+    state[at(PSI, i)], state[at(GAMMA, i)], state[at(BEND, i)] = psi, gamma, bend
+    state[at(PEG, i)], state[at(SIDE, i)], state[at(SIDE_BOX, i)] = peg_box, side, side_box
+    state[at(FACE, i)] = 1.0 if on_face else 0.0
+    state[at(SIDE_LEAN, i)] = lean
+    state[at(MOMENT_X, i)], state[at(MOMENT_Y, i)] = moment_x, moment_y
 
 
 @compiled
@@ -367,7 +376,7 @@ def look_around(
     well above a box is as far from that as it is above, the rest as far as seen from above.
     """
     cell = index_cell(grid, px, py)
-    length = head[LENGTH, i]
+    length = head[at(LENGTH, i)]
     margin = grid[GRID_REACH] - length
     room = min(margin, pz - length * cos_phi)
     if cell >= 0:
@@ -385,6 +394,6 @@ def look_around(
                 extent = (length - begin) * abs(sin_phi)
                 part = clearance(boxes, b, px + start * ux, py + start * uy, ux, uy, extent)
                 room = min(room, max(above, whole, min(part, MOST_ROOM)))
-    memo[MARGIN, i], memo[ROOM, i] = margin - SLACK, room - SLACK
-    memo[FROM_X, i], memo[FROM_Y, i], memo[FROM_Z, i] = pose[0], pose[1], pose[2]
-    memo[FROM_YAW, i], memo[FROM_PHI, i] = pose[3], phi
+    memo[at(MARGIN, i)], memo[at(ROOM, i)] = margin - SLACK, room - SLACK
+    memo[at(FROM_X, i)], memo[at(FROM_Y, i)], memo[at(FROM_Z, i)] = pose[0], pose[1], pose[2]
+    memo[at(FROM_YAW, i)], memo[at(FROM_PHI, i)] = pose[3], phi

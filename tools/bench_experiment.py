@@ -96,7 +96,7 @@ def floor_row() -> dict[str, Any]:
     """The plant alone, whiskers at rest in the air."""
     made, _ = make_setup(main_rig(scale(1, False), 0, "open_loop"))
     model = head_model(made.boxes, made.head)
-    state, memo = rest_state(made.head), fresh_memo()
+    state, memo = rest_state(made.head).reshape(-1), fresh_memo().reshape(-1)
     pose = np.array([0.63, 0.45, 0.3, 0.0])
     command = np.zeros(18, dtype=np.float32)
     sample = np.zeros((3, 18), dtype=np.float32)

@@ -60,7 +60,8 @@ def wall_across(near: float, thickness: float = 0.012) -> np.ndarray:
 
 
 def weight_term(plant: HeadPlant, theta: np.ndarray) -> np.ndarray:
-    return -plant.model.head[WEIGHT] * np.sin(plant.params.geometry.phi_start - theta)
+    weight = plant.model.head.reshape(-1, WHISKERS)[WEIGHT]
+    return -weight * np.sin(plant.params.geometry.phi_start - theta)
 
 
 def strolling(t: int) -> tuple[float, float, float, float]:
