@@ -11,7 +11,7 @@ from vibrissa.processes.node import Output
 FIRST = "slam"
 PART = 200
 """Cycles per message."""
-SILENT_CYCLES = 2
+SILENT_CYCLES = 5
 """A SLAM is not ready, or no longer the run's, when it has not told its pose for more than these.
 Its answer to a cycle arrives while the next one goes on."""
 

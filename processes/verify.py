@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import importlib.util
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -167,6 +168,7 @@ class Checks:
         self._start = start
         self._path = path
         self._installed = controllers.available(experiment) | slams.available(experiment)
+        self._named = {*experiment.controllers.values(), *experiment.slams.values()}
         self._lost: dict[str, int] = {}
         self.recalled: list[str] = []
         """What was computed that is not in the log, one line per process that was killed."""
@@ -255,6 +257,13 @@ class Checks:
                 f"{self._path}: {_word(order.node)} {order.name} is not installed and the run "
                 f"loaded it into {order.node}; installed are {', '.join(self._installed)}"
             )
+        target = self._installed.get(order.name, "") if order.kind == "assign" else ""
+        module = target.partition(":")[0] if target in self._named else ""
+        if module and not _findable(module):
+            raise UnusableLogError(
+                f"{self._path}: {_word(order.node)} {order.name} ({target}) is not installed: "
+                f"there is no module {module} here"
+            )
         if order.kind == "open" and order.node in ALL_SLOTS and order.node not in self._by_name:
             self._add([order.node])
 
@@ -268,3 +277,11 @@ class Checks:
 
 def _word(slot: str) -> str:
     return "slam" if slot in SLAM_SLOTS else "controller"
+
+
+def _findable(module: str) -> bool:
+    """Whether there is a module of this name; it may still raise an error when imported."""
+    try:
+        return importlib.util.find_spec(module) is not None
+    except (ImportError, ValueError):
+        return False
