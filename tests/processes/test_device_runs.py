@@ -230,7 +230,7 @@ def test_nothing_moves_before_the_operators_start_and_everything_stops_without_a
                 assert client.start() == "started"
                 with pytest.raises(RunError, match="started already"):
                     client.start()
-            wait_for(lambda: float(arm.ask("travelled")) > 0.0, "an arm that moves")
+            wait_for(lambda: _says_enabled(out / "run.mcap"), "an arm that is enabled")
             os.kill(popen.pid, signal.SIGKILL)
             popen.wait()
             wait_for(lambda: _log_is_closed(out / "run.mcap"), "a log that is closed")
@@ -254,6 +254,16 @@ def _asked_to_wait(out: Path) -> bool:
     except RunError as error:
         return "waits for its start" in str(error)
     return False
+
+
+def _says_enabled(log: Path) -> bool:
+    from vibrissa.messages.log_reader import LogReader
+
+    try:
+        events = [message(r) for r in LogReader(log, allow_cut=True) if r.topic == "rig.event"]
+    except (OSError, ValueError):
+        return False
+    return any(event.body.kind == "enabled" for event in events)
 
 
 def _log_is_closed(log: Path) -> bool:
