@@ -23,6 +23,8 @@ import pytest
 from tests.conftest import Recorded
 from tests.processes.live import Schedule, wait_for
 from tests.processes.logs import message
+from vibrissa.messages.log_format import LogError
+from vibrissa.messages.log_reader import LogReader
 from vibrissa.messages.types import Event
 from vibrissa.processes.arm import make_path
 from vibrissa.processes.client import Client
@@ -257,21 +259,17 @@ def _asked_to_wait(out: Path) -> bool:
 
 
 def _says_enabled(log: Path) -> bool:
-    from vibrissa.messages.log_reader import LogReader
-
     try:
         events = [message(r) for r in LogReader(log, allow_cut=True) if r.topic == "rig.event"]
-    except (OSError, ValueError):
+    except (OSError, LogError):
         return False
     return any(event.body.kind == "enabled" for event in events)
 
 
 def _log_is_closed(log: Path) -> bool:
-    from vibrissa.messages.log_reader import LogReader
-
     try:
         return LogReader(str(log), allow_cut=True).complete is not False
-    except (OSError, ValueError):
+    except (OSError, LogError):
         return False
 
 
