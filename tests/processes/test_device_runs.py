@@ -268,7 +268,7 @@ def _says_enabled(log: Path) -> bool:
 
 def _log_is_closed(log: Path) -> bool:
     try:
-        return LogReader(str(log), allow_cut=True).complete is not False
+        return sum(1 for _ in LogReader(log)) > 0
     except (OSError, LogError):
         return False
 
