@@ -23,6 +23,8 @@ import pytest
 from tests.conftest import Recorded
 from tests.processes.live import Schedule, wait_for
 from tests.processes.logs import message
+from vibrissa.messages.log_format import LogError
+from vibrissa.messages.log_reader import LogReader
 from vibrissa.messages.types import Event
 from vibrissa.processes.arm import make_path
 from vibrissa.processes.client import Client
@@ -230,7 +232,7 @@ def test_nothing_moves_before_the_operators_start_and_everything_stops_without_a
                 assert client.start() == "started"
                 with pytest.raises(RunError, match="started already"):
                     client.start()
-            wait_for(lambda: float(arm.ask("travelled")) > 0.0, "an arm that moves")
+            wait_for(lambda: _says_enabled(out / "run.mcap"), "an arm that is enabled")
             os.kill(popen.pid, signal.SIGKILL)
             popen.wait()
             wait_for(lambda: _log_is_closed(out / "run.mcap"), "a log that is closed")
@@ -256,12 +258,18 @@ def _asked_to_wait(out: Path) -> bool:
     return False
 
 
-def _log_is_closed(log: Path) -> bool:
-    from vibrissa.messages.log_reader import LogReader
-
+def _says_enabled(log: Path) -> bool:
     try:
-        return LogReader(str(log), allow_cut=True).complete is not False
-    except (OSError, ValueError):
+        events = [message(r) for r in LogReader(log, allow_cut=True) if r.topic == "rig.event"]
+    except (OSError, LogError):
+        return False
+    return any(event.body.kind == "enabled" for event in events)
+
+
+def _log_is_closed(log: Path) -> bool:
+    try:
+        return sum(1 for _ in LogReader(log)) > 0
+    except (OSError, LogError):
         return False
 
 
