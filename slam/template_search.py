@@ -37,7 +37,7 @@ BUCKETS: Final = 256
 FINE_CELLS: Final = 64
 """Templates of at most so many pixels have a cell per pixel."""
 LANES_SMALL: Final = 128
-LANES_LARGE: Final = 32
+LANES_LARGE: Final = 64
 """Templates per block: few of many pixels, and enough for loops over bytes to be vectors."""
 MOST_LEVELS: Final = 255 // TOGETHER
 """Differences of so many levels, TOGETHER of them added up, fit a byte."""
