@@ -147,21 +147,20 @@ def rcp_command(
         state[CYCLE] = cycle
     slot = WINDOW + tick % window
     share = protraction_at(tick, period)
-    for i in range(command.shape[0]):
+    for i in range(WHISKERS):
         excess = abs(y[i] - parameters[MEAN, i]) - parameters[THRESHOLD, i]
-        if not 0.0 < excess < math.inf:
-            excess = 0.0
-        total = state[SUM, i] + (excess - state[slot, i])
+        excess = excess if 0.0 < excess < math.inf else 0.0
+        state[SUM, i] += excess - state[slot, i]
         state[slot, i] = excess
-        if slot == WINDOW:  # sum afresh once per window: rounding can't pile up
-            total = 0.0
+    if slot == WINDOW:  # sum afresh once per window: rounding can't pile up
+        for i in range(WHISKERS):
+            state[SUM, i] = 0.0
             for j in range(WINDOW, state.shape[0]):
-                total += state[j, i]
-        state[SUM, i] = total
-        amplitude = parameters[AMPLITUDE, i] - parameters[GAIN, i] * (total / window)
+                state[SUM, i] += state[j, i]
+    for i in range(WHISKERS):
+        amplitude = parameters[AMPLITUDE, i] - parameters[GAIN, i] * (state[SUM, i] / window)
         amplitude = min(max(amplitude, parameters[FLOOR, i]), state[CEILING, i])
-        if reset == LATCH:
-            state[CEILING, i] = amplitude
+        state[CEILING, i] = amplitude if reset == LATCH else state[CEILING, i]
         desired = desired_angle(parameters[MINIMUM, i], amplitude, share)
         command[i] = slewed(desired, state[LAST, i], parameters[SLEW, i])
         state[LAST, i] = command[i]
