@@ -16,6 +16,7 @@ import resource
 import signal
 import time
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Final, Literal
 
 SHADOW_NICE: Final = -15
@@ -54,6 +55,11 @@ def set_threads(priority: int) -> None:
             else:
                 os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
                 os.setpriority(os.PRIO_PROCESS, thread, SHADOW_NICE)
+    if not priority:
+        # every session may be a scheduling group, outside of which the nice value of a thread
+        # means nothing; the group has one of its own
+        with contextlib.suppress(OSError):
+            Path("/proc/self/autogroup").write_text(str(SHADOW_NICE))
 
 
 def lock_memory() -> bool:

@@ -48,6 +48,10 @@ SETTLE_S: Final = 4.0
 LONGEST_S: Final = 3600.0
 AFTER_TICKS: Final = 20
 """Ticks after a switch in which a command that is missing is blamed on it."""
+AGAIN_S: Final = 0.05
+"""From a refusal to the next request: a newcomer that is late needs time to catch up."""
+MOST_REFUSALS: Final = 20
+"""Refusals per swap wanted, after which the bench gives up."""
 SPIN: Final = "while True: pass"
 LOOP_S: Final = 10.0
 
@@ -166,8 +170,9 @@ class Operator(threading.Thread):
             if not str(refusal).startswith("swap to"):
                 raise
             self.refused += 1
-            if self.refused > self._swaps:
+            if self.refused > MOST_REFUSALS * self._swaps:
                 raise
+            time.sleep(AGAIN_S)
             return
         self.asked_ns.append(asked)
         self.answered_ms.append((time.monotonic_ns() - asked) * 1e-6)
