@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from vibrissa.numerics import atan2, compiled, cos, sin
 from vibrissa.rig import elastica
 from vibrissa.rig.beam_table import (
-    LEAST_FIRST,
+    LEAST_HEIGHT,
     LEAST_Q,
-    MOST_FIRST,
+    MOST_HEIGHT,
     interpolate_peg,
     interpolate_tip,
     most_gamma,
@@ -32,7 +32,6 @@ from vibrissa.rig.beam_table import (
 FORMS = ("linear", "table", "exact")
 LINEAR, TABLE, EXACT = range(3)
 EXACT_STEPS = elastica.STEPS
-LEAST_HEIGHT, MOST_HEIGHT = cos(MOST_FIRST), cos(LEAST_FIRST)
 
 
 def beam_tables(ratios: tuple[float, ...], size: int) -> NDArray[np.float64]:

@@ -49,7 +49,8 @@ Float64s = NDArray[np.float64]
 SIZE = 57
 STEPS = 64  # of the shooting, far finer than the interpolation
 LEAST_Q = 0.1
-LEAST_FIRST, MOST_FIRST = 1e-3, 1.5207754699891267  # rad; acos(0.05)
+LEAST_FIRST, MOST_FIRST = 1e-3, 1.5207754699891267  # rad
+LEAST_HEIGHT, MOST_HEIGHT = 0.05, 0.9999995000000417  # their cosines
 MOMENT, ARC, ANGLE, MOST = range(4)  # of the peg table
 OFFSET, ARC_LENGTH, MIDDLE = 1, 2, 3  # of a tip table, besides MOMENT
 

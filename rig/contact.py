@@ -187,6 +187,34 @@ def across_edge(
 
 
 @compiled
+def depths(
+    chord: float,
+    drop: float,
+    near: float,
+    far: float,
+    near_x: bool,
+    far_x: bool,
+    ux: float,
+    uy: float,
+    sin_psi: float,
+    cos_psi: float,
+) -> tuple[float, float]:
+    """How deep a straight whisker is in a wall, m: (from above, from inside), by the ways it came.
+
+    From above: to the far upper edge, or to the top where that edge is out of reach; from inside:
+    of the tip to the near face. Measured across edge or face, wherever the whisking plane cuts it.
+    """
+    slope, _ = oblique(near_x, ux, uy)
+    inside = (chord * sin_psi - near) * slope
+    if far * far + drop * drop >= chord * chord:
+        return chord * cos_psi - drop, inside
+    slope, _ = oblique(far_x, ux, uy)
+    x = sin_psi * slope
+    w = max(math.sqrt(x * x + cos_psi * cos_psi), 1e-9)
+    return slope * (far * cos_psi - drop * sin_psi) / w, inside
+
+
+@compiled
 def from_above(
     form: int,
     tables: NDArray[np.float64],
@@ -282,7 +310,7 @@ def from_inside(
         depth = offset * length * cos_phi / side
         hangs = depth + (1.0 - arc) * length * cos_phi / side >= drop > depth
         if depth >= drop and offset > 0.0:
-            tip_holds, tip_angle = True, atan2(near, depth)
+            tip_holds, tip_angle = True, min(atan2(near, depth), phi)
             tip_y = -moment / length * cos_phi * slope / side
             tip_x = -moment / length * left / side
             # Where the shaft crosses the edge's height, bent like a cylinder under a tip force.

@@ -66,6 +66,7 @@ HEAD_ROWS = SHAFT_ROWS + 26
     GAMMA,  # rad, psi - phi: > 0 pushed back while protracting, < 0 hooked while retracting
     PEG,  # wall touched in the whisking plane: box, or number of boxes for the floor; -1 none
     FACE,  # 1 where the tip is on the top or the face of that wall, 0 the shaft on its edge
+    ABOVE,  # 1 where the whisker came down on that wall, 0 where it hangs behind it
     SIDE,  # 1 pushed to the left (counterclockwise seen from above) by a wall met sideways, -1, 0
     SIDE_BOX,  # the box that pushes sideways, -1 none
     SIDE_LEAN,  # horizontal lean sideways, offset over distance from the pivot, >= 0
@@ -85,8 +86,8 @@ HEAD_ROWS = SHAFT_ROWS + 26
     RING_Y2_RATE,
     DRIFT_X,  # N m
     DRIFT_Y,
-) = range(26)
-STATE_ROWS = 26
+) = range(27)
+STATE_ROWS = 27
 
 # Rows of the memo float64[MEMO_ROWS, 18]. A fresh memo of zeros knows nothing.
 (

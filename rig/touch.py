@@ -16,6 +16,7 @@ from vibrissa.rig.contact import (
     ON_FACE,
     PAST,
     clearance,
+    depths,
     from_above,
     from_inside,
     side_extent,
@@ -24,6 +25,7 @@ from vibrissa.rig.contact import (
     wall_side,
 )
 from vibrissa.rig.rows import (
+    ABOVE,
     BEND,
     DRAG,
     FACE,
@@ -114,6 +116,7 @@ def touch(
         state[at(SIDE, i)],
     )
     lean, on_face = state[at(SIDE_LEAN, i)], state[at(FACE, i)] > 0.0
+    came_down = state[at(ABOVE, i)] > 0.0
     old_peg, old_side_box = peg_box, side_box
     sin_psi, cos_psi, known = 0.0, 0.0, False  # of psi, once it is asked for
     floor = boxes.shape[0]
@@ -147,7 +150,7 @@ def touch(
             continue
         own = b == peg_box
         if own:
-            above = gamma > 0.0
+            above = came_down
         else:
             if not known:
                 sin_psi, cos_psi, known = sin(psi), cos(psi), True
@@ -158,8 +161,7 @@ def touch(
             if where == 0:
                 # The head carried the wall into the whisker: the shortest way out is the way it
                 # came.
-                inner, outer = wall_angles(chord, drop, near, far)
-                out = min(outer - psi, psi - inner)
+                over, back = depths(chord, drop, near, far, near_x, far_x, ux, uy, sin_psi, cos_psi)
                 if sin_psi > 0.0:
                     start, stop = drop * sin_psi / max(cos_psi, 1e-12), chord * sin_psi
                     left, left_u, right, right_u = side_extent(
@@ -173,13 +175,13 @@ def touch(
                             cost = max(left - lean, 0.0) * left_u
                         else:
                             cost = max(-right - lean, 0.0) * right_u
-                        if cost < out * length:
+                        if cost < min(over, back):
                             if side == 0.0 and (
                                 cost < grab_cost or (cost == grab_cost and b < grab)
                             ):
                                 grab, grab_cost, grab_side = b, cost, toward
                             continue
-                above = outer - psi <= psi - inner
+                above = over <= back
         face = on_face
         what, angle, moment_y, moment_x = FREE, phi, 0.0, 0.0
         for attempt in range(2):
@@ -232,6 +234,7 @@ def touch(
             high_y, high_x = moment_y, moment_x
 
     psi, peg_box, on_face, moment_y, moment_x = phi, -1, False, 0.0, 0.0
+    came_down = low_box >= 0
     if low_box >= 0:
         psi, peg_box, on_face, moment_y, moment_x = low, low_box, low_face, low_y, low_x
     elif high_box >= 0:
@@ -301,6 +304,7 @@ def touch(
                         )
                     if what not in (FREE, PAST) and (angle > psi if above else peg_box < 0):
                         psi, peg_box, on_face = angle, side_box, what == ON_FACE
+                        came_down = above
                         moment_y, moment_x = one, two
             side, side_box, lean = 0.0, -1, 0.0
 
@@ -347,6 +351,7 @@ def touch(
     state[at(PSI, i)], state[at(GAMMA, i)], state[at(BEND, i)] = psi, gamma, bend
     state[at(PEG, i)], state[at(SIDE, i)], state[at(SIDE_BOX, i)] = peg_box, side, side_box
     state[at(FACE, i)] = 1.0 if on_face else 0.0
+    state[at(ABOVE, i)] = 1.0 if came_down else 0.0
     state[at(SIDE_LEAN, i)] = lean
     state[at(MOMENT_X, i)], state[at(MOMENT_Y, i)] = moment_x, moment_y
 

@@ -86,6 +86,7 @@ BENCHES: Final[dict[str, str]] = {
     "faults": "vibrissa.tools.bench_faults:bench",
     "devices": "vibrissa.tools.bench_devices:bench",
     "swap": "vibrissa.tools.bench_swap:bench",
+    "rig": "vibrissa.tools.bench_rig:bench",
     "slam": "vibrissa.tools.bench_slam:bench",
     "slam-stress": "vibrissa.tools.bench_slam_stress:bench",
     "experiment": "vibrissa.tools.bench_experiment:bench",
@@ -114,7 +115,9 @@ def bench(
     ] = None,
     quick: Annotated[
         bool,
-        typer.Option("--quick", help="Small sizes, to see that a bench works (slam, devices)."),
+        typer.Option(
+            "--quick", help="Small sizes, to see that a bench works (slam, rig, devices)."
+        ),
     ] = False,
     swaps: Annotated[
         int | None, typer.Option(min=1, help="How many swaps to make (swap only).")
