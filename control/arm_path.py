@@ -24,6 +24,8 @@ Pose = tuple[float, float, float, float]
 AXES = 4  # x, y, z, yaw
 NS = 1e9
 DEGREE = math.pi / 180.0
+MOST_WOUND = 2.5 * math.pi
+"""rad, how far an unwinding path turns from its first heading."""
 
 
 class ArmPathError(ValueError):
@@ -54,6 +56,8 @@ class Motion:
     speed             m/s along the legs, and acceleration m/s^2 of every straight move
     yaw_rate          rad/s of turns in place, and yaw_acceleration rad/s^2
     yaw_along_travel  the head faces where it goes; otherwise its first heading is kept
+    unwind            turn back by whole turns, in place, before a circuit that would wind the yaw
+                      further than MOST_WOUND from the first heading: for a wrist that has ends
     working_height    m, nose plane above the floor while travelling
     lift              m, the head starts this much higher
     lowering_speed    m/s
@@ -66,6 +70,7 @@ class Motion:
     yaw_rate: float = 30.0 * DEGREE
     yaw_acceleration: float = 120.0 * DEGREE
     yaw_along_travel: bool = True
+    unwind: bool = False
     working_height: float = NOSE_HEIGHT
     lift: float = 0.1
     lowering_speed: float = 0.05
@@ -230,7 +235,7 @@ class ArmPath:
 
         x, y = route.points[0]
         height = motion.working_height
-        heading = _heading(route.points[0], route.points[1])
+        first = heading = _heading(route.points[0], route.points[1])
         moves = _Moves((x, y, height + motion.lift, heading))
         moves.hold(motion.t_start)
         down = (x, y, height, heading)
@@ -239,6 +244,16 @@ class ArmPath:
         ends: list[int] = []
         for k in range(1, len(route.points)):
             number = len(ends)
+            begins = k == 1 or k - 1 == route.circuit_ends[number - 1]
+            if motion.yaw_along_travel and motion.unwind and begins:
+                wound = heading - first
+                after = wound + _net_turn(
+                    heading, route.points[k - 1 : route.circuit_ends[number] + 1]
+                )
+                back = _unwinding(wound, after)
+                heading += back
+                facing = (x, y, height, heading)
+                moves.go(facing, abs(back), motion.yaw_rate, motion.yaw_acceleration)
             if motion.yaw_along_travel:
                 turn = _turn(heading, _heading(route.points[k - 1], route.points[k]))
                 heading += turn
@@ -349,6 +364,21 @@ def _turn(yaw: float, heading: float) -> float:
     if math.pi - abs(turn) < 1e-9:
         return math.pi if yaw <= 0.0 else -math.pi
     return 0.0 if abs(turn) < 1e-9 else turn
+
+
+def _net_turn(yaw: float, points: Float64s) -> float:
+    """How far the head turns along points float64[n, 2], from yaw, rad."""
+    end = yaw
+    for k in range(1, len(points)):
+        end += _turn(end, _heading(points[k - 1], points[k]))
+    return end - yaw
+
+
+def _unwinding(before: float, after: float) -> float:
+    """The fewest whole turns, rad, that bring a yaw from `before` to `after` within MOST_WOUND."""
+    beyond = max(abs(before), abs(after)) - MOST_WOUND
+    turns = math.ceil(beyond / (2.0 * math.pi)) if beyond > 0.0 else 0
+    return -math.copysign(2.0 * math.pi * turns, before + after)
 
 
 def _check_motion(motion: Motion, limits: ArmLimits) -> None:

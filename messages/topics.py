@@ -27,6 +27,8 @@ class Topic:
 _ROWS: Final = (
     Topic("rig.sample", types.HeadReading, 2000, "rig"),
     Topic("rig.arm", types.ArmReading, 125, "rig"),
+    Topic("rig.event", types.Event, 0, "rig"),
+    Topic("rig.clock", types.DeviceClock, 0, "rig", compared=False),
     Topic("head.sample", types.HeadSample, 2000, "sampler"),
     Topic("head.command", types.HeadCommand, 2000, "sampler"),
     Topic("whisk.command", types.WhiskCommand, 2000, "whisk"),

@@ -72,6 +72,8 @@ class ZmqPort:
         self._heard: set[bytes] = set()
         self._bundling = False
         self._waited_ms = -1
+        self._poller: zmq.Poller | None = None
+        self._waiting_for = -1
         self._topics = {topic.encode() for topic in topics}
         self._bundled = bundled
         self._unbundled: collections.deque[bytes] = collections.deque()
@@ -120,6 +122,15 @@ class ZmqPort:
                 return None
             self._unbundle(bundle)
         return self._unbundled.popleft()
+
+    def wait(self, other: int, timeout: float) -> None:
+        """Until a frame or the file descriptor `other` can be read, or whole ms of `timeout` s."""
+        if self._poller is None or other != self._waiting_for:
+            self._poller, self._waiting_for = zmq.Poller(), other
+            self._poller.register(self._in, zmq.POLLIN)
+            if other >= 0:
+                self._poller.register(other, zmq.POLLIN)
+        self._poller.poll(int(timeout * 1000))
 
     def _unbundle(self, bundle: bytes) -> None:
         try:

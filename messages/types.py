@@ -128,6 +128,18 @@ class ArmReading:
 
 
 @dataclass(slots=True, eq=False)
+class DeviceClock:
+    """How a device's clock reads on the host's: a line through its least delayed messages."""
+
+    version: ClassVar[int] = 1
+    device: Annotated[str, Text(40)]
+    tick: Tick
+    device_ns: Annotated[int, Int(0, 2**62, "ns, the device's own clock at the end of the line")]
+    host_ns: Annotated[int, Int(-(2**62), 2**62, "ns since tick 0 was due, at that moment")]
+    drift: Annotated[float, Real(1.0, "how much faster the host's clock runs, 1e-6 is one ppm")]
+
+
+@dataclass(slots=True, eq=False)
 class ArmState:
     """Head pose as the system uses it (ground truth), with where the path is."""
 

@@ -33,6 +33,7 @@ def make_path(experiment: Experiment, sequence: str = "") -> ArmPath:
     motion = Motion(
         speed=experiment.arm.speed,
         lift=experiment.arm.lift,
+        unwind=experiment.arm.unwind,
     )
     route = circuit(maze.width, maze.height, sequence or experiment.arm.sequence, pitch=maze.pitch)
     corner = (maze.width * maze.pitch + MARGIN, maze.height * maze.pitch + MARGIN, 0.4)
@@ -72,7 +73,10 @@ class ArmNode:
                 self._departure = message.t + TICK_NS
             case "run.event" if message.body.kind == "start":
                 self._started = not self._ended
-            case "run.event" | "host.event" if message.body.kind in ("retract", "stop"):
+            case "run.event" | "rig.event" | "host.event" if message.body.kind in (
+                "retract",
+                "stop",
+            ):
                 self._started, self._ended = False, True
         return []
 

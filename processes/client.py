@@ -48,6 +48,10 @@ class Client:
             self._context.destroy(linger=0)
             raise
 
+    def start(self) -> str:
+        """The operator's explicit start of a run with real devices, which waits for it."""
+        return self._ask("start")[0]
+
     def controllers(self) -> dict[str, Any]:
         """What is installed and what is loaded, with the state and record of each."""
         return self._ask("controllers")[1]

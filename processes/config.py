@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from vibrissa.messages.types import TICK_HZ
+from vibrissa.processes.calibration_file import VIRTUAL_HEAD, from_text
 from vibrissa.processes.results import RunError
 
 DEFAULT_MAZE = "board7x5.maze"
@@ -52,6 +53,35 @@ class Maze(Section):
     text: Annotated[str, Field(description="the file's content; filled in when it is read")] = ""
 
 
+class Rig(Section):
+    """[rig]: the devices, by URL."""
+
+    head: Annotated[
+        str,
+        Field(
+            min_length=1,
+            max_length=200,
+            description="virtual, serial:PORT or can:INTERFACE:CHANNEL",
+        ),
+    ] = "virtual"
+    arm: Annotated[str, Field(min_length=1, max_length=200, description="virtual or rtde:HOST")] = (
+        "virtual"
+    )
+    emulate: Annotated[
+        bool, Field(description="play devices that are not virtual by emulators of this machine")
+    ] = False
+
+    @property
+    def virtual(self) -> bool:
+        """Whether the rig is simulated inside the run, so that a re-run can compute it."""
+        return self.head == self.arm == "virtual"
+
+    @property
+    def real(self) -> bool:
+        """Whether anything real moves, for which a person has to give the start."""
+        return not (self.virtual or self.emulate)
+
+
 class Head(Section):
     """[head]: the simulated head. Ranges are those the mechanics are tested in."""
 
@@ -75,7 +105,20 @@ class Whisk(Section):
     period: Annotated[float, Field(ge=0.2, le=10, description="s per whisk cycle")] = 1.0
     calibration_cycles: Annotated[int, Field(ge=1, le=1000)] = 4
     rcp_gain: Annotated[float, Field(ge=0, le=1000, description="in contact stiffnesses")] = 3.0
+    calibration: Annotated[
+        str, Field(description="file of vibrissa calibrate, instead of calibrating")
+    ] = ""
+    calibration_text: Annotated[
+        str, Field(description="the file's content; filled in when it is read")
+    ] = ""
     rcp_window: Annotated[float, Field(ge=0.0005, le=1, description="s, averaging window")] = 0.01
+
+    @property
+    def calibrated_head(self) -> str:
+        """Serial number of the head that the calibration file is of; empty without one."""
+        if not self.calibration_text:
+            return ""
+        return from_text(self.calibration_text, self.calibration)[1]
 
 
 class Arm(Section):
@@ -85,6 +128,10 @@ class Arm(Section):
         str, Field(pattern="^[CA]{1,100}$", description="C clockwise, A anticlockwise circuits")
     ] = "CCCAAACACA"
     speed: Annotated[float, Field(gt=0, le=0.25, description="m/s")] = 0.04
+    unwind: Annotated[
+        bool,
+        Field(description="turn back between circuits: joints have ends"),
+    ] = False
     lift: Annotated[
         float, Field(ge=0, le=0.3, description="m above the working height while calibrating")
     ] = 0.1
@@ -122,6 +169,7 @@ class Experiment(Section):
 
     run: Run = Run()
     maze: Maze = Maze()
+    rig: Rig = Rig()
     head: Head = Head()
     whisk: Whisk = Whisk()
     arm: Arm = Arm()
@@ -169,6 +217,8 @@ class Experiment(Section):
                 if node in seen:
                     raise ValueError(f"run.together: {node!r} is named twice")
                 seen.add(node)
+        if "rig" in seen and not self.rig.virtual:
+            raise ValueError("run.together: 'rig' is real or emulated, in processes of its own")
         for node in ("whisk", "slam", "arm"):
             cycles = [swap.at_cycle for swap in self.swap if swap.node == node]
             if any(later - earlier < 2 for earlier, later in itertools.pairwise(cycles)):
@@ -230,6 +280,15 @@ def load_experiment(
             raise RunError(f"{where}: {error}") from None
         maze = experiment.maze.model_copy(update={"text": text})
         experiment = experiment.model_copy(update={"maze": maze})
+    named = experiment.whisk.calibration
+    if named and not experiment.whisk.calibration_text:
+        try:
+            learnt = ((path.parent if path else Path()) / named).read_text()
+        except (OSError, UnicodeDecodeError) as error:
+            why = getattr(error, "strerror", None) or error
+            raise RunError(f"{where}: whisk.calibration {named!r}: {why}") from None
+        whisk = experiment.whisk.model_copy(update={"calibration_text": learnt})
+        experiment = experiment.model_copy(update={"whisk": whisk})
     _check_parts(experiment, where)
     return experiment
 
@@ -238,6 +297,7 @@ def _check_parts(experiment: Experiment, where: str) -> None:
     """What only the nodes' own modules can judge: maze, circuit, controller, RatSLAM parameters."""
     from vibrissa.processes import controllers, slams
     from vibrissa.processes.arm import make_path
+    from vibrissa.processes.emulators import check
 
     known = {"whisk": controllers.available(experiment), "slam": slams.available(experiment)}
     named = [
@@ -254,6 +314,10 @@ def _check_parts(experiment: Experiment, where: str) -> None:
             if swap.node == "arm":
                 make_path(experiment, swap.to)
         slams.make_slam_config(experiment)
+        check(experiment)
+        of = experiment.whisk.calibrated_head
+        if of not in ("", VIRTUAL_HEAD) and experiment.rig.head == "virtual":
+            raise RunError(f"whisk.calibration is of head {of}, rig.head is virtual")
     except (ValueError, RunError) as error:
         raise RunError(f"{where}: {error}") from None
 

@@ -8,6 +8,9 @@ Clients (the command line, scripts) ask and are answered. Every message is a msg
 
 from __future__ import annotations
 
+import os
+import time
+from collections.abc import Callable, Generator, Mapping
 from typing import Any
 
 import msgpack
@@ -79,6 +82,35 @@ class ControlLine:
 
     def close(self) -> None:
         self._socket.close()
+
+    def wait_for_go(
+        self, parent: int, subscribers: Callable[[], Mapping[str, int]], wanted: Mapping[str, int]
+    ) -> Generator[None, None, int]:
+        """Say ready when everybody listens, then wait, a little per turn; ends with t0 in ns.
+
+        Raises SystemExit when the supervisor (process `parent`) is gone or calls the run off.
+        """
+        told = False
+        while True:
+            heard = subscribers()
+            if not told and all(heard.get(topic, 0) >= n for topic, n in wanted.items()):
+                self.say("ready")
+                told = True
+            order = self.hear(0.02)
+            if order and order["kind"] == "go":
+                t0_ns: int = order["t0_ns"]
+                return t0_ns
+            if os.getppid() != parent or (order and order["kind"] == "leave"):
+                raise SystemExit(1)
+            yield
+
+    def wait_to_leave(self, parent: int) -> None:
+        """Until the supervisor (process `parent`) says so or is gone, but not for ever."""
+        deadline = time.monotonic() + 15
+        while time.monotonic() < deadline and os.getppid() == parent:
+            order = self.hear(0.05)
+            if order and order["kind"] == "leave":
+                break
 
 
 class ControlDesk:

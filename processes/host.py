@@ -12,7 +12,7 @@ import os
 import signal
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from typing import Any, Final
 
 import numpy as np
@@ -125,7 +125,8 @@ class Host:
 
     def run(self) -> None:
         """Barrier, loop, farewell."""
-        self._wait_for_go()
+        for _ in self._wait_for_go():
+            pass
         loop: dict[str, Callable[[], None]] = {
             "timer": self._timer_loop,
             "arrival": self._arrival_loop,
@@ -151,20 +152,9 @@ class Host:
         )
         self._wait_to_leave()
 
-    def _wait_for_go(self) -> None:
-        expected = self.layout.audience(self.name)
-        told = False
-        while True:
-            heard = self.port.subscribers()
-            if not told and all(heard.get(topic, 0) >= n for topic, n in expected.items()):
-                self.control.say("ready")
-                told = True
-            order = self.control.hear(0.02)
-            if order and order["kind"] == "go":
-                self.t0 = order["t0_ns"]
-                return
-            if os.getppid() != self._parent or (order and order["kind"] == "leave"):
-                raise SystemExit(1)
+    def _wait_for_go(self) -> Generator[None, None, None]:
+        wanted = self.layout.audience(self.name)
+        self.t0 = yield from self.control.wait_for_go(self._parent, self.port.subscribers, wanted)
 
     def _timer_loop(self) -> None:
         tick = 0
@@ -329,11 +319,7 @@ class Host:
             self._feed(frame)
 
     def _wait_to_leave(self) -> None:
-        deadline = time.monotonic() + 15
-        while time.monotonic() < deadline and os.getppid() == self._parent:
-            order = self.control.hear(0.05)
-            if order and order["kind"] == "leave":
-                break
+        self.control.wait_to_leave(self._parent)
         self.control.close()
         self.port.close()
         self.context.term()

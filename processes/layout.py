@@ -18,6 +18,7 @@ SUPERVISOR_HEARS = (
     "node.answer",
     "node.event",
     "node.telemetry",
+    "rig.event",
     "slam.owner",
     "whisk.calibration",
     "whisk.failure",
@@ -40,6 +41,8 @@ class Layout:
     """What the log says about the run."""
     controllers: dict[str, str] = field(default_factory=dict)
     """slot -> the controller its process is to be warm for"""
+    devices: dict[str, str] = field(default_factory=dict)
+    """"head" and "arm" -> URL to open; "tell" -> port at which an emulated head takes its pose"""
 
     def write(self, path: Path) -> None:
         path.write_text(json.dumps(asdict(self)))

@@ -13,6 +13,8 @@ from vibrissa.messages.log_format import LogError
 from vibrissa.processes.control import ControlLine
 from vibrissa.processes.layout import Layout
 from vibrissa.processes.results import RunError
+from vibrissa.processes.table import DEVICES
+from vibrissa.rig.devices.errors import DeviceError
 
 
 def main() -> None:
@@ -25,11 +27,15 @@ def main() -> None:
             from vibrissa.processes import recorder
 
             recorder.main(layout)
+        elif name in DEVICES:
+            from vibrissa.processes import pump
+
+            pump.main(name, layout)
         else:
             from vibrissa.processes import host
 
             host.main(name, layout)
-    except (MessageError, LogError, RunError) as error:
+    except (MessageError, LogError, RunError, DeviceError) as error:
         report_failure(layout.endpoints["control"], name, str(error))
         sys.exit(2)
     except Exception as error:

@@ -65,6 +65,8 @@ def what_if(
     check_replacements(replacements)
     reader = open_log(log)
     experiment = experiment_of(reader)
+    if "rig" in replacements and not experiment.rig.virtual:
+        raise UnusableLogError(f"{log}: rig was no node in this run, it can't be replaced")
     rerun = affected(replacements)
     steppers = {n: make_stepper(n, experiment, replacements) for n in rerun}
     make_directory(out)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 import numpy as np
 
@@ -17,16 +17,20 @@ from vibrissa.rig.plant import ARM_PERIOD, ArmPlant, HeadPlant, HeadPlantParams
 from vibrissa.rig.scene import wall_boxes
 
 
+def head_settings(experiment: Experiment) -> dict[str, Any]:
+    """What an experiment says of the simulated head, by names of HeadPlantParams."""
+    head = experiment.head
+    return {
+        "servo_stiffness": head.motor_stiffness,
+        "servo_frequency": head.motor_frequency,
+        "sensor_noise": head.moment_noise,
+        "encoder_noise": head.angle_noise,
+    }
+
+
 def head_params(experiment: Experiment) -> HeadPlantParams:
     """The simulated head an experiment asks for."""
-    head = experiment.head
-    return dataclasses.replace(
-        HeadPlantParams(),
-        servo_stiffness=head.motor_stiffness,
-        servo_frequency=head.motor_frequency,
-        sensor_noise=head.moment_noise,
-        encoder_noise=head.angle_noise,
-    )
+    return HeadPlantParams(**head_settings(experiment))
 
 
 class RigNode:

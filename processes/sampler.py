@@ -68,7 +68,7 @@ class SamplerNode:
                 return self._obey(body)
             case "run.event" if body.kind == "start" and not self._retracting:
                 return self._route(CONTROLLER)
-            case "run.event" | "host.event" if body.kind in ("retract", "stop"):
+            case "run.event" | "rig.event" | "host.event" if body.kind in ("retract", "stop"):
                 return self._start_retracting()
         return []
 

@@ -79,8 +79,13 @@ def simulate(
 ) -> dict[str, Any]:
     """Run an experiment in logical time; write out/run.mcap and out/summary.json.
 
-    Raises RunError when the directory exists or can't be made.
+    Raises RunError when the rig is not virtual, and when the directory exists or can't be made.
     """
+    if not experiment.rig.virtual:
+        rig = experiment.rig
+        raise RunError(
+            f"rig.head {rig.head!r}, rig.arm {rig.arm!r}: only a virtual rig can be simulated"
+        )
     make_directory(out)
     text = experiment.model_dump_json()
     names = [*PROCESSES, *scheduled_slots(experiment)]

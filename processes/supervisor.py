@@ -34,13 +34,21 @@ from vibrissa.messages.types import TICK_HZ, TICK_NS, Event, Order, WhiskCalibra
 from vibrissa.processes import provenance
 from vibrissa.processes.config import RETRACT_S, Experiment
 from vibrissa.processes.control import ControlDesk
+from vibrissa.processes.emulators import devices
 from vibrissa.processes.gate import Gate
 from vibrissa.processes.kinds import scheduled_slots
 from vibrissa.processes.layout import Layout
 from vibrissa.processes.registry import listed
 from vibrissa.processes.requests import Requests
 from vibrissa.processes.results import OnProgress, Progress, RunError, one_line, silent
-from vibrissa.processes.table import ALL_SLOTS, PROCESSES, RECORDER_SILENCE, ROWS, SLOTS
+from vibrissa.processes.table import (
+    ALL_SLOTS,
+    DEVICES,
+    PROCESSES,
+    RECORDER_SILENCE,
+    ROWS,
+    SLOTS,
+)
 
 LEAD_S: Final = 0.25
 """From the go to tick 0."""
@@ -98,7 +106,15 @@ class Child:
 class Supervisor:
     """One live run, from the first process to the summary."""
 
-    def __init__(self, experiment: Experiment, out: Path, on_progress: OnProgress) -> None:
+    def __init__(
+        self,
+        experiment: Experiment,
+        out: Path,
+        on_progress: OnProgress = silent,
+        *,
+        start: bool = False,
+    ) -> None:
+        """start: the operator's start of real devices is given already."""
         self.experiment = experiment
         self.out = out
         self.on_progress = on_progress
@@ -109,9 +125,10 @@ class Supervisor:
         self.sent: collections.Counter[str] = collections.Counter()
         self.cause: str | None = None
         self.requests = Requests(self)
-        self._calibration: WhiskCalibration | None = None
+        self.calibration: WhiskCalibration | None = None
         self._seq: collections.Counter[str] = collections.Counter()
         self._interrupted = 0
+        self.started = start or not experiment.rig.real
         self.gate = Gate(limited=False)
         self._refused: collections.Counter[str] = collections.Counter()
         self.t0 = 0
@@ -124,7 +141,11 @@ class Supervisor:
 
     def run(self) -> dict[str, Any]:
         """The whole run. Raises RunError when it can't start; otherwise always gives a summary."""
-        with self._folder() as folder, self._signals():
+        with (
+            self._folder() as folder,
+            self._signals(),
+            devices(self.experiment, folder) as self.devices,
+        ):
             self.folder = folder
             self.layout = self._layout(folder)
             self.layout.write(folder / "layout.json")
@@ -153,6 +174,7 @@ class Supervisor:
                 self.start_slot(slot, controller)
             self._warm()
             with listed(self.out, self.layout.endpoints["control"]):
+                self._await_start()
                 self._go()
                 self._watch()
             self._end()
@@ -195,7 +217,8 @@ class Supervisor:
         run = self.experiment.run
         together = {n: "+".join(group) for group in run.together for n in group}
         hosts: dict[str, list[str]] = {}
-        for name in PROCESSES:
+        rig = self.experiment.rig
+        for name in PROCESSES if rig.virtual else [*DEVICES, *_without_rig()]:
             hosts.setdefault(together.get(name, name), [])
         for host in hosts:
             hosts[host] = host.split("+")
@@ -207,10 +230,12 @@ class Supervisor:
         else:
             endpoints = {n: f"ipc://{folder}/{n}" for n in names}
         text = self.experiment.model_dump_json()
-        nodes = [*PROCESSES, *scheduled_slots(self.experiment)]
+        nodes = [*(PROCESSES if rig.virtual else _without_rig())]
+        nodes += scheduled_slots(self.experiment)
         meta = provenance.metadata(text, "live") | {"nodes": ",".join(nodes)}
         meta["run_id"] = f"{meta['config_hash'][:12]}-{time.time_ns():x}"
-        return Layout(hosts, endpoints, text, str(self.out.absolute() / "run.mcap"), meta)
+        log = str(self.out.absolute() / "run.mcap")
+        return Layout(hosts, endpoints, text, log, meta, devices=self.devices.urls)
 
     def _start(self, name: str) -> None:
         environment = os.environ | {
@@ -237,20 +262,27 @@ class Supervisor:
                 heard.get(topic, 0) >= n for topic, n in wanted.items()
             ):
                 return
-            for child in self.children.values():
-                if child.popen.poll() is not None:
-                    self._listen()  # its last words
-                    why = (
-                        self.cause
-                        or child.last_words
-                        or f"{child.name} could not start (see above)"
-                    )
-                    raise RunError(why)
-            if self._interrupted:
-                raise RunError("interrupted before the run started")
+            self._check_all_there()
             if time.monotonic() > deadline:
                 late = ", ".join(n for n in self.children if n not in ready)
                 raise RunError(f"not ready after {WARM_S:g} s: {late}")
+
+    def _check_all_there(self) -> None:
+        """Raises RunError when a run that has not begun has lost a process or its operator."""
+        for child in self.children.values():
+            if child.popen.poll() is not None:
+                self._listen()  # its last words
+                why = self.cause or child.last_words or f"{child.name} could not start (see above)"
+                raise RunError(why)
+        if self._interrupted:
+            raise RunError("interrupted before the run started")
+
+    def _await_start(self) -> None:
+        """Hold everything until the operator's explicit start; devices that are real need one."""
+        while not self.started:
+            self._listen()
+            self._report("waiting", 0.0, "real devices: nothing moves before `vibrissa start`")
+            self._check_all_there()
 
     def _go(self) -> None:
         self.t0 = time.monotonic_ns() + int(LEAD_S * 1e9)
@@ -360,16 +392,16 @@ class Supervisor:
 
     def hand_over_calibration(self) -> bool:
         """Repeat the calibration for newcomers; False when there is none yet."""
-        if self._calibration is None:
+        if self.calibration is None:
             return False
-        self._publish("run.calibration", self._calibration)
+        self._publish("run.calibration", self.calibration)
         return True
 
     def _expendable(self, name: str) -> bool:
         """Whether the run goes on without this process: it hosts one controller of several."""
         others = self.requests.slots.keys() - {name}
         return name in ALL_SLOTS or (
-            name == "whisk" and self._calibration is not None and bool(others)
+            name == "whisk" and self.calibration is not None and bool(others)
         )
 
     def _lose(self, child: Child, why: str) -> None:
@@ -400,7 +432,7 @@ class Supervisor:
     def _check_controllers(self, why: str) -> None:
         """End a run that has no controller left, or none that could be calibrated."""
         slots = self.requests.slots
-        if not slots or ("whisk" not in slots and self._calibration is None):
+        if not slots or ("whisk" not in slots and self.calibration is None):
             self.cause = self.cause or f"no controller left: {why}"
 
     def _until(self, seconds: float, phase: str, done: Any) -> None:
@@ -435,9 +467,11 @@ class Supervisor:
                 continue
             self.requests.heard(message)
             if message.topic == "whisk.calibration":
-                self._calibration = message.body
+                self.calibration = message.body
             if message.topic == "whisk.failure":
                 self._failed(message.source, message.body)
+            if message.topic == "rig.event":
+                self._device(message.body)
             if message.topic == "node.event":
                 event: Event = message.body
                 self._note(event.tick, event.kind, event.node, event.cause)
@@ -445,6 +479,12 @@ class Supervisor:
                     self.requests.failed(message.source)
                 if event.kind in FATAL:
                     self.cause = self.cause or f"{event.node}: {event.cause}"
+
+    def _device(self, event: Event) -> None:
+        """What a device's process decided; one that makes the rig retract ends the run."""
+        self._note(event.tick, event.kind, event.node, event.cause)
+        if event.kind == "retract":
+            self.cause = self.cause or f"{event.node}: {event.cause}"
 
     def _take(self, name: str, message: dict[str, Any]) -> None:
         if message["kind"] == "ask":
@@ -488,7 +528,12 @@ class Supervisor:
             with contextlib.suppress(zmq.ZMQError):  # a client that is gone needs no answer
                 self.desk.say(name, "answer", accepted=accepted, text=text, data=data)
 
-        if self.cause is None:
+        if verb == "start":
+            waited, self.started = not self.started, True
+            reply(waited, "started" if waited else "the run has started already", {})
+        elif not self.started:
+            reply(False, "the run waits for its start", {})
+        elif self.cause is None:
             self.requests.ask(verb, arguments, reply)
         else:
             reply(False, "the run is ending", {})
@@ -558,13 +603,21 @@ class Supervisor:
         }
 
 
-def run_live(experiment: Experiment, out: Path, on_progress: OnProgress = silent) -> dict[str, Any]:
+def run_live(
+    experiment: Experiment, out: Path, on_progress: OnProgress = silent, *, start: bool = False
+) -> dict[str, Any]:
     """Run an experiment live; write out/run.mcap and out/summary.json; return the summary.
+
+    start: the operator's explicit start, without which a run with real devices waits for one.
 
     Raises RunError when the run can't start: the directory exists, a port is in use, a process
     does not come up. Once it runs it always ends in order, and the summary names the cause.
     """
-    return Supervisor(experiment, out, on_progress).run()
+    return Supervisor(experiment, out, on_progress, start=start).run()
+
+
+def _without_rig() -> list[str]:
+    return [name for name in PROCESSES if name != "rig"]
 
 
 def _dead(child: Child) -> bool:

@@ -14,8 +14,9 @@ if TYPE_CHECKING:
     from vibrissa.processes.config import Experiment
     from vibrissa.processes.node import Node
 
-Pacing = Literal["timer", "arrival", "drain"]
-"""How a live host waits: for its own 2 kHz timer, for each message, or a few ms at a time."""
+Pacing = Literal["timer", "arrival", "drain", "device"]
+"""How a live host waits: for its own 2 kHz timer, for each message, a few ms at a time, or for what
+its device says."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +49,7 @@ PROCESSES: Final[dict[str, Process]] = {
             "rig",
             "vibrissa.processes.rig:RigNode",
             hears=("host.timer", "head.command", "arm.setpoint", "run.event"),
-            says=("rig.sample", "rig.arm"),
+            says=("rig.sample", "rig.arm", "rig.event", "rig.clock"),
             pacing="timer",
             priority=50,
             source=True,
@@ -62,6 +63,7 @@ PROCESSES: Final[dict[str, Process]] = {
                 "whisk.failure",
                 "run.order",
                 "run.event",
+                "rig.event",
                 "host.event",
             ),
             says=(
@@ -96,7 +98,14 @@ PROCESSES: Final[dict[str, Process]] = {
         Process(
             "arm",
             "vibrissa.processes.arm:ArmNode",
-            hears=("rig.arm", "whisk.calibration", "run.order", "run.event", "host.event"),
+            hears=(
+                "rig.arm",
+                "whisk.calibration",
+                "run.order",
+                "run.event",
+                "rig.event",
+                "host.event",
+            ),
             says=("arm.state", "arm.setpoint", "node.answer", "node.event"),
             pacing="arrival",
             priority=40,
@@ -153,7 +162,33 @@ SLAM_SLOTS: Final[dict[str, Process]] = {
 """Empty places for SLAMs beside the first one."""
 
 ALL_SLOTS: Final = SLOTS | SLAM_SLOTS
-ROWS: Final = PROCESSES | ALL_SLOTS
+
+DEVICES: Final[dict[str, Process]] = {
+    row.name: row
+    for row in (
+        Process(
+            "head-device",
+            "vibrissa.processes.head_device:HeadPump",
+            hears=("head.command", "rig.arm", "run.event"),
+            says=("rig.sample", "rig.event", "rig.clock"),
+            pacing="device",
+            priority=50,
+        ),
+        Process(
+            "arm-device",
+            "vibrissa.processes.arm_device:ArmPump",
+            hears=("arm.setpoint", "rig.clock", "rig.event", "run.event"),
+            says=("rig.arm", "rig.event", "rig.clock"),
+            pacing="device",
+            priority=40,
+            silence=20.0,  # enabling an arm may take long; its own watchdog is what stops it
+        ),
+    )
+}
+"""What takes the place of `rig` when a device is real or emulated. They are no nodes: what they say
+is a recorded input, like a person's order, and no re-run computes it."""
+
+ROWS: Final = PROCESSES | ALL_SLOTS | DEVICES
 
 RECORDER_PRIORITY: Final = 20
 """Above ordinary work, which would starve it on a busy machine."""

@@ -68,6 +68,9 @@ def verify(
         )
     names = reader.metadata.get("nodes", ",".join(PROCESSES)).split(",")
     notes = provenance.mismatches(reader.metadata)
+    if not experiment.rig.virtual:
+        rig = experiment.rig
+        notes.append(f"rig: recorded inputs, not re-run (head {rig.head}, arm {rig.arm})")
     with _runners(executor, experiment, replacements) as start, _no_collections():
         checks = Checks(start, names, experiment, path)
         return _verify(reader, experiment, executor, checks, notes, on_progress)

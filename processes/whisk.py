@@ -31,6 +31,7 @@ from vibrissa.messages.types import (
     WhiskCommand,
     WhiskCycle,
 )
+from vibrissa.processes.calibration_file import from_text
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.controllers import make_controller
 from vibrissa.processes.node import Output
@@ -56,7 +57,8 @@ class WhiskNode:
     For the first cycles the head is held free: what the whiskers feel then is the calibration. A
     touch during calibration is a fault that ends the run, because the thresholds would be blind.
     Cycles in which the drives did not get what was commanded are no free whisking; calibration
-    starts over after them. A controller that comes later is handed the calibration.
+    starts over after them. A controller that comes later is handed the calibration. With the file
+    of an earlier calibration one cycle is enough: it shows that nothing touches, the file counts.
 
     A controller that raises an error, or answers with anything but 18 finite angles, has failed: it
     is never asked again, and the sampler hears of it in the same tick.
@@ -67,6 +69,11 @@ class WhiskNode:
         self._experiment = experiment
         self._period = experiment.period_ticks
         self._calibration_cycles = experiment.whisk.calibration_cycles
+        self._given: Calibration | None = None
+        if experiment.whisk.calibration_text:
+            text, file = experiment.whisk.calibration_text, experiment.whisk.calibration
+            self._given = from_text(text, f"whisk.calibration {file}")[0]
+            self._calibration_cycles = 1
         self._disturbed = False
         self._attempts = 1
         self._controller: Controller | None = None
@@ -127,7 +134,7 @@ class WhiskNode:
             off = np.abs(sample.command - before).max()
             self._disturbed |= bool(off > DISTURBANCE)
             yield from self._calibrate(self._calibrator, sample)
-        if (tick + 1) % self._period == 0:
+        if (tick + 1) // self._period > self._cycle_start // self._period:  # samples may be lost
             cycle = self._cycle(tick, calibrating)
             if self._owner:
                 self._cycles += 1
@@ -179,6 +186,8 @@ class WhiskNode:
             return []
         try:
             calibration = calibrator.result()
+            if self._given is not None:
+                calibration = self._given
         except CalibrationError as error:
             self._calibrator = None
             return [_fault(sample.tick, str(error))]
@@ -205,7 +214,7 @@ class WhiskNode:
 
     def _cycle(self, tick: int, calibrating: bool) -> WhiskCycle:
         cycle = WhiskCycle(
-            cycle=tick // self._period,
+            cycle=self._cycle_start // self._period,
             first_tick=self._cycle_start,
             last_tick=tick,
             calibrating=int(calibrating),

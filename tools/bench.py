@@ -84,6 +84,7 @@ BENCHES: Final[dict[str, str]] = {
     "live": "vibrissa.tools.bench_live:bench",
     "replay": "vibrissa.tools.bench_replay:bench",
     "faults": "vibrissa.tools.bench_faults:bench",
+    "devices": "vibrissa.tools.bench_devices:bench",
     "swap": "vibrissa.tools.bench_swap:bench",
     "rig": "vibrissa.tools.bench_rig:bench",
     "slam": "vibrissa.tools.bench_slam:bench",
@@ -113,7 +114,10 @@ def bench(
         typer.Option(help="Directory for bench-NAME.json, its picture and its logs; kept."),
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Small sizes, to see that a bench works (slam, rig).")
+        bool,
+        typer.Option(
+            "--quick", help="Small sizes, to see that a bench works (slam, rig, devices)."
+        ),
     ] = False,
     swaps: Annotated[
         int | None, typer.Option(min=1, help="How many swaps to make (swap only).")

@@ -9,7 +9,18 @@ from typing import Annotated
 import typer
 
 from vibrissa import __version__
-from vibrissa.tools import bench, control, doctor, export, logs, new_controller, rerun, run, tune
+from vibrissa.tools import (
+    bench,
+    calibrate,
+    control,
+    doctor,
+    export,
+    logs,
+    new_controller,
+    rerun,
+    run,
+    tune,
+)
 from vibrissa.tools.console import fail
 from vibrissa.tools.experiment import command as experiment
 
@@ -46,7 +57,19 @@ def _root(
     pass
 
 
-for room in (run, control, new_controller, rerun, logs, tune, export, experiment, bench, doctor):
+for room in (
+    run,
+    calibrate,
+    control,
+    new_controller,
+    rerun,
+    logs,
+    tune,
+    export,
+    experiment,
+    bench,
+    doctor,
+):
     for verb, example in room.VERBS:
         app.command(example.split()[1], epilog=f"Example: `{example}`")(verb)
 

@@ -2,15 +2,39 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
 from vibrissa.tools.console import Json, print_json, stdout, table
 
 
-def doctor(as_json: Json = False) -> None:
+def doctor(
+    rig: Annotated[
+        Path | None, typer.Option(help="Experiment file whose devices to look at instead.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
     """Show this machine, its versions and its real-time privileges, with advice.
 
     Nothing is changed. A run starts without any of the privileges; ticks are late more often then.
+    With --rig, its devices are opened and asked who they are: nothing is told to move. Exit code 2
+    when one can't be used.
     """
     from vibrissa.tools.machine import advice, machine
+
+    if rig is not None:
+        from vibrissa.tools.probe import probe
+
+        found = probe(rig)
+        if as_json:
+            print_json(found)
+            return
+        for device, lines_of in found.items():
+            for key, value in lines_of.items():
+                stdout().print(f"{device} {key}: {value}", markup=False)
+        return
 
     facts, lines = machine(), advice()
     if as_json:

@@ -32,9 +32,18 @@ def run(
     controller: Controller = None,
     seed: Seed = None,
     out: Out = None,
+    start: Annotated[
+        bool,
+        typer.Option(
+            "--start", help="Real devices: give the start now, do not wait for vibrissa start."
+        ),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Run an experiment live at 2 kHz: real processes, real sockets, one log.
+
+    With real devices everything is made ready, then waits for `vibrissa start`: nothing moves
+    before. A virtual or emulated rig starts at once.
 
     Ctrl-C ends the run in an orderly way: whiskers retract, the log closes. Exit code 1 when the
     run ended before its time, 2 when it could not start.
@@ -45,7 +54,7 @@ def run(
     experiment = load_experiment(file, duration=duration, controller=controller, seed=seed)
     out = out or next_directory("run")
     with progress_bar() as on_progress:
-        summary = run_live(experiment, out, on_progress)
+        summary = run_live(experiment, out, on_progress, start=start)
     report(summary, out, as_json)
 
 

@@ -263,3 +263,23 @@ def test_speeds_and_pauses_are_one_per_circuit() -> None:
         ArmPath(circuit(7, 5, "CC"), pauses=[0.0, -1.0])
     with pytest.raises(ArmPathError, match=r"speed of circuit 1 is 0.0"):
         ArmPath(circuit(7, 5, "CC"), speeds=[0.04, 0.0])
+
+
+@pytest.mark.parametrize("sequence", ["C", "CCC", "AAAA", "CCCAAACACA", "CACACC"])
+def test_an_unwinding_path_goes_the_same_way_and_never_winds_up(sequence: str) -> None:
+    route = circuit(7, 5, sequence)
+    wound = ArmPath(route, Motion())
+    unwound = ArmPath(route, Motion(unwind=True))
+    yaw = unwound.poses(np.arange(0, unwound.duration_ns, 10**8))[:, 3]
+    assert np.abs(yaw - yaw[0]).max() <= 2.5 * np.pi + 1e-9
+    for path_a, path_b in ((wound, unwound), (unwound, wound)):
+        there = {tuple(np.round(path_a.pose(int(t))[:2], 9)) for t in path_a.circuit_ends_ns}
+        assert there == {
+            tuple(np.round(path_b.pose(int(t))[:2], 9)) for t in path_b.circuit_ends_ns
+        }
+    if sequence == "C":
+        assert unwound.duration_ns == wound.duration_ns
+    for end in unwound.circuit_ends_ns[:-1].tolist():  # turning back, the head stays where it is
+        turn = unwound.poses(np.arange(end, end + 10**9, 10**7))
+        if np.abs(turn[:, 3] - turn[0, 3]).max() > 0.0:
+            np.testing.assert_allclose(turn[:, :3], turn[:1, :3].repeat(len(turn), 0), atol=1e-12)

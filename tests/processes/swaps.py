@@ -79,7 +79,7 @@ class Live:
     def calibrated(self) -> None:
         """Wait until the first controller has the drives and calibration is over."""
         self.until(lambda: any(e["kind"] == "start" for e in self.supervisor.events))
-        self.until(lambda: self.supervisor._calibration is not None)
+        self.until(lambda: self.supervisor.calibration is not None)
 
     def told(self, kind: str, *words: str) -> dict[str, Any]:
         """Wait for an event that holds all the words."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import importlib
 from itertools import combinations
 
 import pytest
@@ -13,8 +14,10 @@ from vibrissa.messages.transport import BUNDLE
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.framelog import channels
 from vibrissa.processes.layout import Layout
+from vibrissa.processes.pump import Pump
 from vibrissa.processes.table import (
     ALL_SLOTS,
+    DEVICES,
     PROCESSES,
     PUBLISHED_BY_HOSTS,
     ROWS,
@@ -34,9 +37,16 @@ def test_every_topic_of_the_process_table_is_in_the_topic_table(row: Process) ->
     assert not set(row.says) & set(PUBLISHED_BY_HOSTS)
 
 
-@every_process
-def test_every_node_of_the_table_can_be_made(row: Process, short: Experiment) -> None:
-    assert callable(build(row.name, short).step)
+@pytest.mark.parametrize("name", PROCESSES | ALL_SLOTS)
+def test_every_node_of_the_table_can_be_made(name: str, short: Experiment) -> None:
+    assert callable(build(name, short).step)
+
+
+@pytest.mark.parametrize("name", DEVICES)
+def test_every_device_of_the_table_has_a_process_that_says_what_the_rig_would(name: str) -> None:
+    module, _, attribute = DEVICES[name].node.partition(":")
+    assert issubclass(getattr(importlib.import_module(module), attribute), Pump)
+    assert set(DEVICES[name].says) <= set(PROCESSES["rig"].says)
 
 
 @every_process

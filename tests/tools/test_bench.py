@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from tests.tools.conftest import rewrite, vibrissa
 from vibrissa.messages.log_format import Record
-from vibrissa.tools import bench, bench_live, bench_replay, floors
+from vibrissa.tools import bench, bench_devices, bench_live, bench_replay, floors
 from vibrissa.tools.bench import Bench, Target
 from vibrissa.tools.console import plain
 
@@ -128,3 +128,18 @@ def test_json_has_no_word_for_nan_and_knows_numpy() -> None:
         "b": [None, [0, 1]],
         "3": "x",
     }
+
+
+def test_devices_are_measured_beside_a_virtual_rig(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench_devices, "RIGS", {"can": bench_devices.RIGS["can"]})
+    monkeypatch.setattr(bench_devices, "QUICK_S", 1.0)
+    found = bench_devices.bench(tmp_path, 60.0, lambda _progress: None, quick=True)
+    run, *parsers = found.rows
+    assert run["rig"] == "can" and run["ticks"] > 0 and run["verified"] == "yes"
+    assert run["obeyed_p50_ticks"] >= 1 and run["latency_p50_us"] > 0
+    assert [row["parser"] for row in parsers] == ["serial", "can"]
+    assert {t.name: t.met for t in bench_devices.targets([run, run], parsers)}[
+        "can: logs that verify"
+    ]

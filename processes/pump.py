@@ -1,0 +1,257 @@
+"""A process that stands between a device and the bus: what the device says becomes messages.
+
+It takes the place of `rig` where a device is real or emulated. It is no node: what it publishes is
+a recorded input of the run, and every decision it takes about the device is a `rig.event`. It opens
+its device while the run warms up, reads it from then on, and lets nothing move before the start.
+"""
+
+from __future__ import annotations
+
+import collections
+import os
+import signal
+import time
+import traceback
+from abc import ABC, abstractmethod
+from typing import Any, Final
+
+import numpy as np
+import zmq
+
+from vibrissa.messages.codec import CODECS, Message, decode, header
+from vibrissa.messages.errors import DecodeError
+from vibrissa.messages.transport import ZmqPort
+from vibrissa.messages.types import TICK_NS, DeviceClock, Event, Telemetry
+from vibrissa.processes import realtime
+from vibrissa.processes.config import Experiment
+from vibrissa.processes.control import ControlLine
+from vibrissa.processes.gate import Gate
+from vibrissa.processes.layout import Layout
+from vibrissa.processes.results import RunError, one_line
+from vibrissa.processes.stats import Clocking
+from vibrissa.processes.table import DEVICES
+from vibrissa.rig.devices.arm import ArmDevice
+from vibrissa.rig.devices.clock import ClockRelation
+from vibrissa.rig.devices.errors import DeviceError
+from vibrissa.rig.devices.head import HeadDevice
+from vibrissa.rig.devices.watch import Watch
+
+BUNDLE_NS: Final = 10_000_000
+HOUSEKEEPING_NS: Final = 50_000_000
+TELEMETRY_NS: Final = 1_000_000_000
+PARTING_TICKS: Final = 600
+"""Ticks it goes on for after its supervisor is gone, so that what moves can stop."""
+
+
+class Pump(ABC):
+    """One device of a live run. A subclass opens and reads it, and takes what the bus says."""
+
+    device: HeadDevice | ArmDevice
+
+    def __init__(self, name: str, layout: Layout, watch: Watch) -> None:
+        self.name = name
+        self.layout = layout
+        self.watch = watch
+        self.experiment = Experiment.model_validate_json(layout.experiment)
+        row = DEVICES[name]
+        wanted = row.priority if self.experiment.run.realtime else 0
+        missing = realtime.prepare(wanted, row.cores)
+        self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self.control = ControlLine(self.context, layout.endpoints["control"], name)
+        self.control.say("hello", pid=os.getpid(), missing=missing)
+        self.port = ZmqPort(
+            self.context, layout.endpoints[name], layout.hears(name), layout.connections(name)
+        )
+        self.gate = Gate()
+        self.clock = Clocking()
+        self.sent: collections.Counter[str] = collections.Counter()
+        self.last_tick = self.experiment.ticks
+        self.t0 = 0
+        self.tick = 0
+        self.steps = 0
+        self.done = False
+        self.stopping = False
+        self._parent = os.getppid()
+        self._leave_at = 0
+        self._flushed = self._housekept = self._accounted = 0
+
+    def run(self) -> None:
+        """Open, barrier, loop, farewell; SystemExit when the device can't be used."""
+        try:
+            self._prepare()
+        except (DeviceError, RunError) as error:
+            self.control.say("fault", cause=str(error)[:400])
+            self._leave()
+            raise SystemExit(2) from None
+        cpu = time.process_time()
+        try:
+            while not self.stopping:
+                self.turn()
+                self._housekeep()
+        except DeviceError as error:
+            self.give_up(str(error))
+        except Exception as error:
+            traceback.print_exc()
+            self.give_up(f"{type(error).__name__}: {error}")
+        finally:
+            self.device.close()
+        self._account()
+        self.port.flush()
+        self.control.say(
+            "bye",
+            sent=dict(self.sent),
+            stats={self.name: self.clock.summary()},
+            cpu_s=time.process_time() - cpu,
+            counters={self.name: self.counters()},
+        )
+        self.control.wait_to_leave(self._parent)
+        self._leave()
+
+    def _prepare(self) -> None:
+        """Open the device, wait for the others and for the go, reading on meanwhile."""
+        self.device.open()
+        try:
+            self.opened()
+            wanted = self.layout.audience(self.name)
+            waiting = self.control.wait_for_go(self._parent, self.port.subscribers, wanted)
+            while True:
+                next(waiting)
+                self.drain()
+        except StopIteration as end:
+            self.t0 = end.value
+        except BaseException:
+            self.device.close()
+            raise
+
+    def _leave(self) -> None:
+        self.control.close()
+        self.port.close()
+        self.context.term()
+
+    @abstractmethod
+    def opened(self) -> None:
+        """Look at the open device before anything may move. Raises DeviceError or RunError."""
+
+    @abstractmethod
+    def drain(self) -> None:
+        """Take what the device says before the run, for nobody."""
+
+    @abstractmethod
+    def turn(self) -> None:
+        """Wait a little, read the device, hear the bus, look after both."""
+
+    @abstractmethod
+    def heard(self, message: Message) -> None:
+        """Take a message of the bus that is no decision about the run."""
+
+    @abstractmethod
+    def halt(self, cause: str) -> None:
+        """Bring what moves to rest; never raises."""
+
+    @abstractmethod
+    def counters(self) -> dict[str, int]:
+        """What the summary says of the device."""
+
+    @property
+    def now(self) -> int:
+        """The present tick of the host's clock."""
+        return max((time.monotonic_ns() - self.t0) // TICK_NS, 0)
+
+    def hear(self) -> None:
+        """Take everything that was said on the bus."""
+        while (frame := self.port.receive(0)) is not None:
+            if not self.gate.admits(frame):
+                continue
+            try:
+                message = decode(frame)
+            except DecodeError as error:
+                self.gate.refuse(header(frame)[1], str(error))
+                continue
+            self._take(message)
+
+    def _take(self, message: Message) -> None:
+        if message.topic not in ("run.event", "rig.event"):
+            self.heard(message)
+            return
+        event: Event = message.body
+        if event.kind in ("retract", "stop"):
+            self.watch.stop(event.cause)
+            self.halt(event.cause)
+            self.stopping |= message.topic == "run.event" and event.kind == "stop"
+        elif message.topic == "run.event":
+            self.heard(message)
+
+    def give_up(self, cause: str) -> None:
+        """Stop for good, and tell everybody: whiskers retract, the arm brakes, the run ends."""
+        if self.watch.stop(cause):
+            self.halt(cause)
+            self.report("retract", cause)
+
+    def look(self, now: int) -> None:
+        """Give up when something that must keep coming is overdue."""
+        if self.watch.look(now):
+            self.halt(self.watch.cause)
+            self.report("retract", self.watch.cause)
+
+    def report(self, kind: str, cause: str) -> None:
+        """Say what happened to the device, for every node and the log."""
+        self.say("rig.event", Event(self.tick, kind, self.name, one_line(cause)))
+
+    def say(self, topic: str, body: Any) -> None:
+        """Publish in the name of this process."""
+        seq = self.sent[topic]
+        self.sent[topic] += 1
+        self.port.publish(CODECS[topic].encode(self.name, 0, seq, self.tick * TICK_NS, body))
+
+    def say_clock(self, device: str, relation: ClockRelation, device_ns: int) -> int:
+        """Publish how the device's clock reads on the host's; gives the host's ns since t0."""
+        host_ns = relation.host_ns(device_ns) - self.t0
+        drift = max(-1.0, min(relation.drift, 1.0))
+        self.say("rig.clock", DeviceClock(device, self.tick, device_ns, host_ns, drift))
+        return host_ns
+
+    def _housekeep(self) -> None:
+        now = time.monotonic_ns()
+        if now - self._flushed < BUNDLE_NS:
+            return
+        self._flushed = now
+        if now - self._housekept < HOUSEKEEPING_NS:
+            self.port.flush()
+            return
+        self._housekept = now
+        self.port.subscribers()
+        self.housekeep()
+        if now - self._accounted > TELEMETRY_NS:
+            self._accounted = now
+            self._account()
+        self.port.flush()
+        self.control.say("beat", t=self.tick * TICK_NS, steps=self.steps, done=self.done)
+        for source, (count, cause) in self.gate.take_refused().items():
+            self.control.say("refused", source=source, count=count, cause=cause)
+        if self._leave_at:
+            self.stopping |= now >= self._leave_at
+        elif os.getppid() != self._parent:
+            self._leave_at = now + PARTING_TICKS * TICK_NS
+            self.give_up("supervisor gone")
+
+    def housekeep(self) -> None:  # noqa: B027
+        """Some twenty times a second."""
+
+    def _account(self) -> None:
+        body = Telemetry(
+            steps=self.steps,
+            lateness_us=np.array(self.clock.lateness.recent(), np.float32),
+            work_us=np.array(self.clock.work.recent(), np.float32),
+            latency_us=np.array(self.clock.latency.recent(), np.float32),
+            cpu_s=time.process_time(),
+        )
+        self.say("node.telemetry", body)
+
+
+def main(name: str, layout: Layout) -> None:
+    """Entry point of a device process."""
+    from vibrissa.processes.arm_device import ArmPump
+    from vibrissa.processes.head_device import HeadPump
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    (HeadPump if name == "head-device" else ArmPump)(layout).run()

@@ -1,0 +1,126 @@
+"""CAN buses by name, and one of our own that needs nothing but the loopback interface."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import socket
+import struct
+from typing import Any, Final
+
+import can
+
+from vibrissa.rig.devices.errors import DeviceAddressError, DeviceUnavailable
+
+INTERFACES: Final = ("socketcan", "udp_multicast", "virtual", "loopback")
+BITRATE, DATA_BITRATE = 1_000_000, 5_000_000
+_EVERYBODY: Final = "127.255.255.255"
+_HEADER = struct.Struct("<I")
+_KEEP: Final = 1 << 22
+_SO_RCVBUFFORCE: Final = 33
+"""Linux: beyond the system's limit, for those who may."""
+
+
+class LoopbackBus(can.BusABC):
+    """A CAN FD bus between the processes of one machine: datagrams to 127.255.255.255.
+
+    `channel` is a port number. Every member of the port hears every frame of the others. For
+    kernels without CAN and networks without multicast; like them it neither arbitrates nor
+    acknowledges.
+    """
+
+    def __init__(self, channel: Any, **kwargs: Any) -> None:
+        super().__init__(channel, **kwargs)
+        self.channel_info = f"loopback {channel}"
+        self._can_protocol = can.CanProtocol.CAN_FD
+        self._to = (_EVERYBODY, int(channel))
+        self._out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._in = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._out.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        self._out.bind(("127.0.0.1", 0))
+        self._me = self._out.getsockname()
+        self._in.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        _keep_more(self._in.fileno())
+        self._in.bind(self._to)
+        self._in.setblocking(False)
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        while True:
+            try:
+                data, sender = self._in.recvfrom(256)
+            except BlockingIOError:
+                if timeout == 0 or not select.select([self._in], [], [], timeout)[0]:
+                    return None, False
+                continue
+            if sender != self._me and 4 <= len(data) <= 68:
+                identifier = _HEADER.unpack_from(data)[0] & 0x7FF
+                return _message(identifier, data[4:]), False
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        self._out.sendto(_HEADER.pack(msg.arbitration_id) + bytes(msg.data), self._to)
+
+    def fileno(self) -> int:
+        return self._in.fileno()
+
+    def shutdown(self) -> None:
+        super().shutdown()
+        self._in.close()
+        self._out.close()
+
+
+def _keep_more(descriptor: int) -> None:
+    """Let the kernel hold more datagrams for a reader that is kept from running."""
+    with socket.socket(fileno=os.dup(descriptor)) as same:
+        same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _KEEP)  # the system's limit counts
+        with contextlib.suppress(OSError):
+            same.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _KEEP)
+
+
+def _message(identifier: int, data: bytes) -> can.Message:
+    return can.Message(
+        arbitration_id=identifier,
+        data=data,
+        is_extended_id=False,
+        is_fd=True,
+        bitrate_switch=True,
+    )
+
+
+def send_frame(bus: can.BusABC, identifier: int, data: bytes) -> None:
+    """Put one FD frame on a bus. Raises OSError."""
+    try:
+        bus.send(_message(identifier, data))
+    except can.CanError as error:
+        raise OSError(str(error)) from None
+
+
+def open_bus(name: str, interface: str, channel: str) -> can.BusABC:
+    """A bus; `name` is for messages. Raises DeviceAddressError or DeviceUnavailable."""
+    if interface not in INTERFACES:
+        raise DeviceAddressError(
+            f"{name}: interface: expected one of {', '.join(INTERFACES)}, found {interface!r}"
+        )
+    if interface == "loopback":
+        if not channel.isdigit() or not 1024 <= int(channel) < 2**16:
+            raise DeviceAddressError(f"{name}: channel: expected a port, found {channel!r}")
+        try:
+            return LoopbackBus(channel)
+        except OSError as error:
+            raise DeviceUnavailable(f"{name}: can't be opened: {error.strerror}") from None
+    options: dict[str, Any] = {"udp_multicast": {"hop_limit": 0}}.get(interface, {})
+    try:
+        bus = can.Bus(interface=interface, channel=channel, fd=True, **options)
+        if interface == "udp_multicast":
+            _keep_more(bus.fileno())
+        return bus
+    except (can.CanError, OSError, ValueError, NotImplementedError) as error:
+        text = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise DeviceUnavailable(f"{name}: can't be opened: {text}") from None
+
+
+def close_bus(bus: can.BusABC | None) -> None:
+    """Let go of a bus; never raises."""
+    if bus is not None:
+        with contextlib.suppress(can.CanError, OSError):
+            bus.shutdown()

@@ -1,0 +1,84 @@
+"""The head on a CAN FD bus."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import can
+
+from vibrissa.rig.devices.can_bus import (
+    BITRATE,
+    DATA_BITRATE,
+    close_bus,
+    open_bus,
+    send_frame,
+)
+from vibrissa.rig.devices.can_layout import Assembler, check_bus_load, pack_from_host
+from vibrissa.rig.devices.head import HeadDevice
+from vibrissa.rig.devices.limits import HEAD
+from vibrissa.rig.devices.protocol import FromHead, FromHost
+
+MANY = 512
+"""Frames taken at once."""
+
+
+class CanHead(HeadDevice):
+    """A head on `channel` of a python-can interface; `load` is the (least, most) bus load."""
+
+    def __init__(
+        self,
+        interface: str,
+        channel: str,
+        *,
+        bitrate: float = BITRATE,
+        data_bitrate: float = DATA_BITRATE,
+        batch: int = 1,
+        patience: float = HEAD.patience,
+    ) -> None:
+        """bitrate, data_bitrate: bit/s of the two phases. Raises DeviceRefused for an overload."""
+        super().__init__(f"can:{interface}:{channel}", batch=batch, patience=patience)
+        self.load = check_bus_load(self.name, bitrate, data_bitrate)
+        self._interface = interface
+        self._channel = channel
+        self._bus: can.BusABC | None = None
+        self._assembler = Assembler()
+
+    def fileno(self) -> int:
+        try:
+            return self._bus.fileno() if self._bus is not None else -1
+        except NotImplementedError:
+            return -1
+
+    def _open_link(self) -> None:
+        self._bus = open_bus(self.name, self._interface, self._channel)
+        self._assembler.restart()
+
+    def _close_link(self) -> None:
+        bus, self._bus = self._bus, None
+        close_bus(bus)
+
+    def _receive(self, timeout: float) -> Iterator[FromHead]:
+        bus, assembler, counters = self._bus, self._assembler, self.counters
+        assert bus is not None
+        items: list[FromHead] = []
+        try:
+            for _ in range(MANY):
+                message = bus.recv(timeout)
+                if message is None:
+                    break
+                timeout = 0.0
+                if message.is_error_frame:
+                    counters.crc_errors += 1
+                    continue
+                counters.bytes += len(message.data)
+                item = assembler.take((message.arbitration_id, bytes(message.data)))
+                if item is not None:
+                    items.append(item)
+        except can.CanError as error:
+            raise OSError(str(error)) from None
+        counters.frames, counters.resyncs = assembler.frames, assembler.incomplete
+        return iter(items)
+
+    def _send(self, item: FromHost) -> None:
+        assert self._bus is not None
+        send_frame(self._bus, *pack_from_host(item))

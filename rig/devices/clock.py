@@ -1,0 +1,100 @@
+"""How one clock reads on another: offset and drift from stamped arrivals.
+
+A message is never early, so the smallest delay in a stretch of time is the least disturbed. The
+smallest of every half second are kept, and a straight line through the last of them is the
+relation.
+"""
+
+from __future__ import annotations
+
+import collections
+from typing import Final
+
+STRETCH_NS: Final = 500_000_000
+KEPT: Final = 40
+
+
+class ClockRelation:
+    """Host time as a line over device time, both in ns."""
+
+    def __init__(self) -> None:
+        self._points: collections.deque[tuple[int, int]] = collections.deque(maxlen=KEPT)
+        self._begin: int | None = None
+        self._best = (0, 0)
+
+    def see(self, device_ns: int, host_ns: int) -> None:
+        """A message stamped `device_ns` arrived at `host_ns`."""
+        delay = host_ns - device_ns
+        if self._begin is None or device_ns < self._begin:
+            self._begin, self._best = device_ns, (device_ns, delay)
+        elif device_ns - self._begin >= STRETCH_NS:
+            self._points.append(self._best)
+            self._begin, self._best = device_ns, (device_ns, delay)
+        elif delay < self._best[1]:
+            self._best = (device_ns, delay)
+
+    def forget(self) -> None:
+        """The device's clock has started afresh."""
+        self._points.clear()
+        self._begin = None
+
+    @property
+    def drift(self) -> float:
+        """How much faster the host's clock runs: 1e-6 is one ppm; 0 until it can be told."""
+        if len(self._points) < 2:
+            return 0.0
+        _, _, xx, xy = self._sums()
+        return xy / xx if xx else 0.0
+
+    def host_ns(self, device_ns: int) -> int:
+        """Host time at a device time, less the smallest delay of the line."""
+        if not self._points:
+            return device_ns + self._best[1]
+        x, y, xx, xy = self._sums()
+        slope = xy / xx if xx else 0.0
+        return round(device_ns + y + slope * (device_ns - x))
+
+    def _sums(self) -> tuple[float, float, float, float]:
+        n = len(self._points)
+        x0, y0 = self._points[0]
+        x = sum(p[0] - x0 for p in self._points) / n
+        y = sum(p[1] - y0 for p in self._points) / n
+        xx = sum((p[0] - x0 - x) ** 2 for p in self._points)
+        xy = sum((p[0] - x0 - x) * (p[1] - y0 - y) for p in self._points)
+        return x0 + x, y0 + y, xx, xy
+
+
+class CycleTicks:
+    """Ticks of a run for the cycles of a device with a clock of its own.
+
+    Cycles are as far apart as the device stamps them, so that a path sampled at these ticks is as
+    smooth as the device's clock; the ticks follow the host's by one tick per cycle.
+    """
+
+    SLACK: Final = 8
+    """Ticks the arrival of a cycle may be off, by which nothing is corrected."""
+    STEP: Final = 2000
+    """Ticks off beyond which the device's clock was set: its cycles start afresh."""
+
+    def __init__(self, period: float) -> None:
+        """period: s, between cycles."""
+        self._ticks_per_s = 2000.0
+        self._period = period
+        self._last: tuple[float, int] | None = None
+
+    def tick(self, stamp: float, now: int) -> int:
+        """The tick of the cycle stamped `stamp` s that came at tick `now`; always a later one."""
+        if self._last is None:
+            self._last = stamp, max(now, 0)
+            return self._last[1]
+        before, last = self._last
+        cycles = max(round((stamp - before) / self._period), 1)
+        tick = last + max(round(cycles * self._period * self._ticks_per_s), 1)
+        off = now - tick
+        if not -self.STEP < off < self.STEP:
+            tick = now
+        elif abs(off) > self.SLACK:
+            tick += 1 if off > 0 else -1
+        tick = max(tick, last + 1)
+        self._last = stamp, tick
+        return tick
