@@ -173,7 +173,7 @@ def cos(x: float) -> float:
 
 @inlined
 def cos_sin_turn(u: float) -> tuple[float, float]:
-    """Cosine and sine of u turns, |u| < 2^40: of 2 pi u, at most 2 ulp off, for less work than both."""
+    """Cosine and sine of u turns, |u| < 2^40: of 2 pi u, at most 2 ulp off, with less work."""
     t = 4.0 * u + _ROUND
     n = _bits(t)
     y = (u - 0.25 * (t - _ROUND)) * _TURN  # the difference is exact
