@@ -14,6 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from vibrissa.compilation import stay_apart
 from vibrissa.numerics import atan2, compiled, cos, sin
 from vibrissa.rig.beam import peg, tip
 from vibrissa.rig.scene import X_MAX, X_MIN, Y_MAX, Y_MIN
@@ -100,6 +101,7 @@ def side_extent(
     Returns (left, u there, right, u there): the largest and smallest v / u of the box, v the offset
     towards (-uy, ux) and u in m; all zero where the box is beyond start and stop, or start >= stop.
     """
+    stay_apart()
     left, left_u, right, right_u = -1e9, 0.0, 1e9, 0.0
     if start >= stop:
         return 0.0, 0.0, 0.0, 0.0
@@ -242,6 +244,7 @@ def from_above(
     it is pulled back over the far edge or pushed on over the near one (PAST). Where edge and face
     could both hold it, it stays where it was. Moments in E I0 / m.
     """
+    stay_apart()
     edge_angle, held, rests, edge = NO_WALL, False, False, False
     edge_y = edge_x = 0.0
     if far * far + drop * drop < length * length:
@@ -296,6 +299,7 @@ def from_inside(
     would let the other pass through the wall, they share in proportion to how far it would. It is
     free again (PAST) where neither holds it. Moments in E I0 / m.
     """
+    stay_apart()
     if sin_phi * length <= near:
         return FREE, phi, 0.0, 0.0
     slope, left = oblique(near_x, ux, uy)

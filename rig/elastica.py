@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import math
 
+from vibrissa.compilation import stay_apart
 from vibrissa.numerics import atan2, compiled, cos, sin
 
 STEPS = 400  # Runge-Kutta steps from contact to base; the error is below 1e-9
@@ -92,6 +93,7 @@ def solve(
     kind PEG: target the base's distance from the peg, turn the angle gamma; TIP and LYING: target
     its distance from the plane, turn the angle from the plane's normal to the straight shaft.
     """
+    stay_apart()
     limit = (1.0 - LEAST_DIAMETER) / taper if taper > 0.0 else 1e3
     limit = min(limit, 4.0)
     u, v = _residual(kind, taper, p, r, target, turn, steps)
@@ -148,6 +150,7 @@ def last_peg(q: float, steps: int) -> tuple[float, float, float]:
 
     Beyond, it slides past the peg, whatever the force. By golden section over the excess.
     """
+    stay_apart()
     step = 0.01 + 0.03 * q
     excess, gamma = step, 0.0
     force, gamma = peg_past(q, excess, 3.0 * q * excess * math.sqrt(10.0 * q), steps)
@@ -216,6 +219,7 @@ def peg_contact(q: float, gamma: float, steps: int) -> tuple[float, float, float
     Returns (force, arc length to the contact, base moment, angle of the shaft at the contact from
     the base's direction, rad; whether it exists), force in E I0 / d^2 and moment in E I0 / d.
     """
+    stay_apart()
     force, arc, found = 0.0, 1.0, True
     parts = int(gamma / 0.15) + 1
     for n in range(parts):
@@ -254,6 +258,7 @@ def follow_tip(
     first: angle to the plane's normal at first touch; turned, to: rad past it; kind, force and rest
     (tilt or arc length): the solution at ``turned``. Returns (kind, force, rest, whether there is).
     """
+    stay_apart()
     taper = 1.0 - r
     step = to - turned
     while to > turned:
@@ -345,6 +350,7 @@ def tip_contact(
     Returns (base moment in E I0 / L, offset of the contact along the plane, arc length to it,
     whether it exists).
     """
+    stay_apart()
     first = atan2(math.sqrt(1.0 - height * height), height)
     total = first - turn
     kind, force, rest, found = TIP, 0.0, first - 0.5 * math.pi, True

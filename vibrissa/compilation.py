@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba import types
 from numba.core.caching import IndexDataCacheFile
+from numba.extending import intrinsic
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -26,6 +28,23 @@ def inlined(function: F) -> F:
     """Like `compiled`, and part of whatever calls it, so that loops over it are vectorised."""
     jit = numba.njit(cache=True, fastmath=False, error_model="numpy", forceinline=True)
     return cast(F, _checked(jit(function)))
+
+
+@intrinsic
+def stay_apart(_context: Any) -> Any:
+    """Called in a compiled function: keeps it a function of its own wherever it is used.
+
+    For what is long or rarely needed: copied into each of its callers and theirs, the optimiser
+    would have it a dozen times (the contact of one whisker grew to 3.5 MB of machine code).
+    """
+
+    def generate(context: Any, builder: Any, _signature: Any, _arguments: Any) -> Any:
+        attributes = builder.function.attributes
+        attributes.discard("alwaysinline")
+        attributes.add("noinline")
+        return context.get_dummy_value()
+
+    return types.void(), generate
 
 
 class CacheFile(IndexDataCacheFile):
