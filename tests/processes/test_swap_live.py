@@ -6,6 +6,7 @@ fault may be late now and then; what may never happen is told in ticks and messa
 
 from __future__ import annotations
 
+import functools
 import os
 import shutil
 import signal
@@ -233,18 +234,17 @@ def scheduled_as_told(run: Live, client: Any) -> None:
 
 def one_of_two_wins(run: Live, client: Any) -> None:
     """Two clients ask for the next whisk cycle; the later hears who was first, and when."""
-
-    def ask() -> str:
-        with run.client() as mine:
-            return mine.swap("forger", when="cycle")
-
-    for _ in range(20):
-        answers = at_once(ask, ask)
-        won = [answer for answer in answers if isinstance(answer, str)]
-        refusals = [str(answer) for answer in answers if isinstance(answer, RefusedError)]
-        if len(won) == 1 and any("already switching: to whisk." in text for text in refusals):
-            return
-        if any("not ready" in text or "stale" in text for text in refusals):
-            continue
-        swap_or_skip(client, "open_loop")
-    pytest.fail("the two requests never met")
+    heard = []
+    with run.client() as one, run.client() as other:
+        for _ in range(20):
+            answers = at_once(
+                *(functools.partial(c.swap, "forger", when="cycle") for c in (one, other))
+            )
+            won = [answer for answer in answers if isinstance(answer, str)]
+            refusals = [str(answer) for answer in answers if isinstance(answer, RefusedError)]
+            if len(won) == 1 and any("already switching: to whisk." in text for text in refusals):
+                return
+            heard.append(answers)
+            if won:
+                swap_or_skip(client, "open_loop")
+    pytest.fail(f"the two requests never met: {heard}")
