@@ -315,7 +315,8 @@ def test_one_flipped_bit_gives_a_named_refusal_or_a_message_within_its_limits(to
 @given(st.binary(max_size=200))
 def test_random_bytes_are_refused(garbage: bytes) -> None:
     refusal(DecodeError, decode, garbage)
-    refusal(DecodeError, topic_of, garbage + b"\0")
+    if garbage + b"\0" not in {codec.prefix for codec in CODECS.values()}:
+        refusal(DecodeError, topic_of, garbage + b"\0")
 
 
 @every_topic

@@ -17,7 +17,7 @@ from vibrissa.processes.results import UnusableLogError
 from vibrissa.processes.table import PROCESSES
 from vibrissa.processes.verify import verify
 
-SHARES = [0.03, 0.2, 0.5, 0.77, 0.95, 0.999]
+SHARES = [0.06, 0.2, 0.5, 0.77, 0.95, 0.999]
 
 
 def cut(log: Path, out: Path, length: int) -> Path:
@@ -52,6 +52,13 @@ def test_a_cut_log_is_verified_to_its_last_complete_steps_and_says_so(
     assert set(told) == set(PROCESSES)
     assert sum(int(steps) for steps in told.values()) == verdict.steps
     assert verdict.steps == usable_steps(log)
+
+
+def test_a_log_cut_before_its_first_receipts_is_refused(simulated_run: Recorded, tmp_path: Path):
+    """They are written every 0.1 s of a 3 s run."""
+    size = simulated_run.log.stat().st_size
+    log = cut(simulated_run.log, tmp_path / "cut.mcap", int(0.02 * size))
+    assert "it has no receipts, so nothing can be re-run" in refusal(log)
 
 
 def usable_steps(log: Path) -> int:
