@@ -41,7 +41,9 @@ class Run(Section):
     ] = []
     realtime: Annotated[bool, Field(description="ask for SCHED_FIFO and locked memory")] = True
     transport: Annotated[Literal["ipc", "tcp"], Field(description="tcp: loopback only")] = "ipc"
-    tcp_port: Annotated[int, Field(ge=1024, le=65000, description="first of eight ports")] = 5790
+    tcp_port: Annotated[
+        int, Field(ge=1024, le=65000, description="first of the ports, one per process (19)")
+    ] = 5790
 
 
 class Maze(Section):

@@ -13,15 +13,7 @@ import collections
 import contextlib
 import dataclasses
 import json
-import os
-import shutil
-import signal
-import socket
-import subprocess
-import sys
-import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,24 +23,17 @@ from vibrissa.messages.codec import CODECS, decode
 from vibrissa.messages.errors import MessageError
 from vibrissa.messages.transport import ZmqPort
 from vibrissa.messages.types import TICK_HZ, TICK_NS, Event, Order, WhiskCalibration
-from vibrissa.processes import provenance
+from vibrissa.processes.children import Child, dead, start_process, summary
 from vibrissa.processes.config import RETRACT_S, Experiment
 from vibrissa.processes.control import ControlDesk
 from vibrissa.processes.emulators import devices
 from vibrissa.processes.gate import Gate
 from vibrissa.processes.kinds import scheduled_slots
-from vibrissa.processes.layout import Layout
 from vibrissa.processes.registry import listed
 from vibrissa.processes.requests import Requests
 from vibrissa.processes.results import OnProgress, Progress, RunError, one_line, silent
-from vibrissa.processes.table import (
-    ALL_SLOTS,
-    DEVICES,
-    PROCESSES,
-    RECORDER_SILENCE,
-    ROWS,
-    SLOTS,
-)
+from vibrissa.processes.run_plan import layout_of_run, on_signals, run_folder
+from vibrissa.processes.table import ALL_SLOTS
 
 LEAD_S: Final = 0.25
 """From the go to tick 0."""
@@ -68,39 +53,6 @@ FLOOD: Final = 10_000
 POLL_S: Final = 0.02
 FATAL: Final = ("fault",)
 """Kinds of node.event that end a run."""
-
-
-class Child:
-    """A process the supervisor started, and what it has said so far."""
-
-    def __init__(self, name: str, popen: subprocess.Popen[bytes], silence: float) -> None:
-        self.name = name
-        self.popen = popen
-        self.silence = silence
-        self.missing: list[str] = []
-        self.ready = False
-        self.heard = time.monotonic()
-        self.t = 0
-        self.steps = 0
-        self.done = False
-        self.last_words = ""
-        self.bye: dict[str, Any] | None = None
-        self.closed: dict[str, Any] | None = None
-
-    def trouble(self, now: float, t: int) -> str | None:
-        """Why the run can't go on with this process, if so; t is the present time in ns."""
-        code = self.popen.poll()
-        if self.last_words and (self.bye or code is not None):
-            return self.last_words
-        if code is not None and self.bye is None and self.closed is None:
-            how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
-            return f"{self.name} ended unexpectedly ({how})"
-        if now - self.heard > self.silence:
-            what = "has been silent for" if self.ready else "was not ready after"
-            return f"{self.name} {what} {self.silence:g} s"
-        if self.name in SLOTS and 0 < self.t < t - self.silence * 1e9:
-            return f"{self.name} is more than {self.silence:g} s behind"
-        return None
 
 
 class Supervisor:
@@ -142,12 +94,12 @@ class Supervisor:
     def run(self) -> dict[str, Any]:
         """The whole run. Raises RunError when it can't start; otherwise always gives a summary."""
         with (
-            self._folder() as folder,
-            self._signals(),
+            run_folder(self.out, lambda: bool(self.t0)) as folder,
+            on_signals(self.interrupt),
             devices(self.experiment, folder) as self.devices,
         ):
             self.folder = folder
-            self.layout = self._layout(folder)
+            self.layout = layout_of_run(self.experiment, folder, self.out, self.devices.urls)
             self.layout.write(folder / "layout.json")
             context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
             try:
@@ -155,9 +107,9 @@ class Supervisor:
             finally:
                 self._kill_all()
                 context.destroy(linger=0)
-        summary = self._summary()
-        (self.out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
-        return summary
+        found = self._summary()
+        (self.out / "summary.json").write_text(json.dumps(found, indent=1) + "\n")
+        return found
 
     def _serve(self, context: zmq.Context[zmq.Socket[bytes]]) -> None:
         self.desk = ControlDesk(context, self.layout.endpoints["control"])
@@ -169,7 +121,7 @@ class Supervisor:
         )
         try:
             for name in [*self.layout.hosts, "recorder"]:
-                self._start(name)
+                self.children[name] = start_process(name, self.layout, self.folder)
             for slot, controller in scheduled_slots(self.experiment).items():
                 self.start_slot(slot, controller)
             self._warm()
@@ -181,73 +133,6 @@ class Supervisor:
         finally:
             self.port.close()
             self.desk.close()
-
-    @contextlib.contextmanager
-    def _folder(self) -> Iterator[Path]:
-        try:
-            self.out.mkdir(parents=True)
-        except FileExistsError:
-            raise RunError(f"{self.out}: exists; a run never overwrites another") from None
-        except OSError as error:
-            raise RunError(f"{self.out}: {error.strerror}") from None
-        folder = Path(tempfile.mkdtemp(prefix="vibrissa-"))
-        try:
-            yield folder
-        except RunError:
-            with contextlib.suppress(OSError):
-                if not self.t0:  # nothing was recorded
-                    (self.out / "run.mcap").unlink(missing_ok=True)
-                self.out.rmdir()
-            raise
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
-
-    @contextlib.contextmanager
-    def _signals(self) -> Iterator[None]:
-        def interrupt(*_: object) -> None:
-            self._interrupted += 1
-
-        with contextlib.ExitStack() as stack:
-            for number in (signal.SIGINT, signal.SIGTERM):
-                with contextlib.suppress(ValueError):  # not the main thread: nothing to catch
-                    stack.callback(signal.signal, number, signal.signal(number, interrupt))
-            yield
-
-    def _layout(self, folder: Path) -> Layout:
-        run = self.experiment.run
-        together = {n: "+".join(group) for group in run.together for n in group}
-        hosts: dict[str, list[str]] = {}
-        rig = self.experiment.rig
-        for name in PROCESSES if rig.virtual else [*DEVICES, *_without_rig()]:
-            hosts.setdefault(together.get(name, name), [])
-        for host in hosts:
-            hosts[host] = host.split("+")
-        names = ["control", "supervisor", "recorder", *hosts, *ALL_SLOTS]
-        if run.transport == "tcp":
-            endpoints = {n: f"tcp://127.0.0.1:{run.tcp_port + i}" for i, n in enumerate(names)}
-            for name, endpoint in endpoints.items():
-                _check_free(name, int(endpoint.rpartition(":")[2]))
-        else:
-            endpoints = {n: f"ipc://{folder}/{n}" for n in names}
-        text = self.experiment.model_dump_json()
-        nodes = [*(PROCESSES if rig.virtual else _without_rig())]
-        nodes += scheduled_slots(self.experiment)
-        meta = provenance.metadata(text, "live") | {"nodes": ",".join(nodes)}
-        meta["run_id"] = f"{meta['config_hash'][:12]}-{time.time_ns():x}"
-        log = str(self.out.absolute() / "run.mcap")
-        return Layout(hosts, endpoints, text, log, meta, devices=self.devices.urls)
-
-    def _start(self, name: str) -> None:
-        environment = os.environ | {
-            "OPENBLAS_NUM_THREADS": "1",
-            "OMP_NUM_THREADS": "1",
-            "NUMBA_NUM_THREADS": "1",
-        }
-        command = [sys.executable, "-m", "vibrissa.processes.main", name, str(self.folder)]
-        popen = subprocess.Popen(command, env=environment, start_new_session=True)
-        nodes = self.layout.hosts.get(name, [name])
-        silence = RECORDER_SILENCE if name == "recorder" else min(ROWS[n].silence for n in nodes)
-        self.children[name] = Child(name, popen, silence)
 
     def _warm(self) -> None:
         """Wait until everybody is warm, connected and heard by everybody they talk to."""
@@ -331,7 +216,7 @@ class Supervisor:
         if self.cause == "completed":
             end = (self.experiment.ticks - CAUGHT_UP_TICKS) * TICK_NS
             self._until(
-                CATCH_UP_S, "catching up", lambda: all(c.t >= end or _dead(c) for c in hosts)
+                CATCH_UP_S, "catching up", lambda: all(c.t >= end or dead(c) for c in hosts)
             )
         else:
             self._decide("retract", str(self.cause))
@@ -339,17 +224,17 @@ class Supervisor:
             self._until(RETRACT_S, "retracting", lambda: False)
         self.requests.end("the run has ended")
         self._decide("stop", str(self.cause))
-        self._until(BYE_S, "stopping", lambda: all(c.bye or _dead(c) for c in hosts))
+        self._until(BYE_S, "stopping", lambda: all(c.bye or dead(c) for c in hosts))
         recorder = self.children["recorder"]
         for child in hosts:
             if child.bye:
                 self.sent.update(child.bye["sent"])
         died = ", ".join([*(c.name for c in hosts if not c.bye), *self.lost])
         self.desk.say("recorder", "finish", sent=dict(self.sent), cause=str(self.cause), died=died)
-        self._until(CLOSE_S, "closing the log", lambda: bool(recorder.closed) or _dead(recorder))
+        self._until(CLOSE_S, "closing the log", lambda: bool(recorder.closed) or dead(recorder))
         for child in hosts:
             self.desk.say(child.name, "leave")
-        self._until(1.0, "leaving", lambda: all(_dead(c) for c in self.children.values()))
+        self._until(1.0, "leaving", lambda: all(dead(c) for c in self.children.values()))
         self._wall = time.monotonic() - self._wall
 
     @property
@@ -374,7 +259,7 @@ class Supervisor:
             controllers={slot: controller},
         )
         layout.write(self.folder / f"layout-{slot}.json")
-        self._start(slot)
+        self.children[slot] = start_process(slot, self.layout, self.folder)
         self.children[slot].silence = LOAD_S
 
     def slot_ready(self, slot: str) -> bool:
@@ -565,37 +450,9 @@ class Supervisor:
             child.popen.wait()
 
     def _summary(self) -> dict[str, Any]:
-        byes = [c.bye for c in self.children.values() if c.bye]
-        stats = {node: s for bye in byes for node, s in bye["stats"].items()}
-        counters = {node: c for bye in byes for node, c in bye["counters"].items()}
-        closed = self.children["recorder"].closed
-        received = closed["received"] if closed else {}
-        messages = {
-            topic: {
-                "sent": n,
-                "received": received.get(topic, 0),
-                "lost": max(n - received.get(topic, 0), 0),
-            }
-            for topic, n in sorted(self.sent.items())
-        }
-        cpu = sum(bye["cpu_s"] for bye in byes) + (closed["cpu_s"] if closed else 0.0)
-        cpu += time.process_time() - self._cpu0
-        sampler = counters.get("sampler", {})
-        lost = sum(m["lost"] for m in messages.values())
-        return {
-            "ok": self.cause == "completed" and lost == 0,
-            "cause": self.cause,
-            "ticks": sampler.get("ticks", 0),
-            "ticks_answered": sampler.get("answered", 0),
-            "cycles": counters.get("whisk", {}).get("cycles", 0),
-            "messages": messages,
-            **{
-                key: {node: s[key] for node, s in stats.items() if s[key]}
-                for key in ("latency_us", "lateness_us", "work_us", "period_us")
-            },
-            "cpu_cores": round(cpu / max(self._wall, 1e-9), 3),
-            "steps": {name: child.steps for name, child in self.children.items()},
-            "counters": counters,
+        cpu = time.process_time() - self._cpu0
+        parts = summary(self.children.values(), self.sent, self.cause, self._wall, cpu)
+        return parts | {
             "events": self.events,
             "log": self.layout.log,
             "run_id": self.layout.metadata["run_id"],
@@ -614,22 +471,3 @@ def run_live(
     does not come up. Once it runs it always ends in order, and the summary names the cause.
     """
     return Supervisor(experiment, out, on_progress, start=start).run()
-
-
-def _without_rig() -> list[str]:
-    return [name for name in PROCESSES if name != "rig"]
-
-
-def _dead(child: Child) -> bool:
-    return child.popen.poll() is not None
-
-
-def _check_free(name: str, port: int) -> None:
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("127.0.0.1", port))
-        except OSError as error:
-            raise RunError(
-                f"run.tcp_port: port {port} (for {name}) can't be used: {error.strerror}"
-            ) from None

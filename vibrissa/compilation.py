@@ -30,14 +30,7 @@ def inlined(function: F) -> F:
     return cast(F, _checked(jit(function)))
 
 
-@intrinsic
-def stay_apart(_context: Any) -> Any:
-    """Called in a compiled function: keeps it a function of its own wherever it is used.
-
-    For what is long or rarely needed: copied into each of its callers and theirs, the optimiser
-    would have it a dozen times (the contact of one whisker grew to 3.5 MB of machine code).
-    """
-
+def _apart(_context: Any) -> Any:
     def generate(context: Any, builder: Any, _signature: Any, _arguments: Any) -> Any:
         attributes = builder.function.attributes
         attributes.discard("alwaysinline")
@@ -45,6 +38,14 @@ def stay_apart(_context: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(), generate
+
+
+stay_apart = cast(Callable[[], None], intrinsic(_apart))
+"""Called in a compiled function: keeps it a function of its own wherever it is used.
+
+For what is long or rarely needed: copied into each of its callers and theirs, the optimiser would
+have it a dozen times (the contact of one whisker grew to 3.5 MB of machine code).
+"""
 
 
 class CacheFile(IndexDataCacheFile):
