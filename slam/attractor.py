@@ -27,6 +27,7 @@ from vibrissa.slam.packet import (
     STATE,
     close,
     close_rows,
+    largest_layer,
     layer_size,
     margin_of,
     packet_reach,
@@ -105,9 +106,10 @@ def _once(
     count = whole(height * stride)
     end = first + count
     blurred, excited, result = work[BLURRED], work[EXCITED], work[SPARE]
-    lines = work[LINES]
-    line, other = lines[:size], lines[size : 2 * size]
-    least, sums = lines[2 * size : 3 * size], lines[3 * size : 4 * size]
+    # the infinite `least` is where no `line` or `other` of another size ever was or will be
+    lines, most = work[LINES], largest_layer(n, margin)
+    line, other = lines[:size], lines[most : most + size]
+    least, sums = lines[2 * most : 2 * most + size], lines[3 * most : 3 * most + size]
 
     places = np.empty(7, dtype=np.int64)
     length = box[HEADING, LENGTH]

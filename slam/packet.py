@@ -85,18 +85,24 @@ def empty_box(layers: int) -> Ints:
 
 def working_room(n: int, layers: int, excite: Floats, inhibit: Floats) -> Floats:
     """float64[5, cells] of zeros; behind the `layers` layers of a volume one always stays zero."""
-    side = n + 2 * int(margin_of(excite, inhibit))
-    cells = (max(layers, LINE_COUNT) + 2) * int(_size(side, side))
+    largest = int(largest_layer(n, int(margin_of(excite, inhibit))))
+    cells = (max(layers, LINE_COUNT) + 2) * largest
     room = np.zeros((LINES + 1) * cells + ALIGNED, dtype=np.float64)
     start = -(room.ctypes.data // room.itemsize) % ALIGNED
     return room[start : start + (LINES + 1) * cells].reshape(LINES + 1, cells)
 
 
 @compiled
+def largest_layer(n: int, margin: int) -> int:
+    """Cells of a layer that holds the whole torus, in memory."""
+    size: int = _size(n + 2 * margin, n + 2 * margin)
+    return size
+
+
+@compiled
 def zero_layer(n: int, margin: int, layers: int) -> int:
     """Where in a volume the layer that stays zero begins."""
-    size: int = _size(n + 2 * margin, n + 2 * margin)
-    return int(max(layers, LINE_COUNT) * size)
+    return int(max(layers, LINE_COUNT) * largest_layer(n, margin))
 
 
 @compiled

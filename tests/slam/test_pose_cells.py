@@ -436,6 +436,17 @@ def test_tiny_and_huge_steps_give_finite_packets(cells):
             assert 0.0 <= x < 21.0 and 0.0 <= y < 21.0 and 0.0 <= th < 36.0
 
 
+def test_what_flat_loops_leave_around_the_box_stays_finite():
+    """From there it once came into a packet that changed its extent, which then was lost."""
+    draws = np.random.default_rng(0)
+    cells = PoseCells(WHISKER)
+    for _ in range(300):
+        known = cells.views
+        cells.on_view_template(known if known < 40 else int(draws.integers(known)))
+        cells.on_odo(abs(draws.normal(0.01, 0.003)), draws.choice([0.0, 0.0, 0.3, -1.5]), 1.0)
+        assert np.isfinite(cells._work[: packet.LINES]).all()
+
+
 def test_a_hundred_thousand_iterations_keep_the_packet_whole():
     network = PoseCells(IRAT)
     for n in range(100):

@@ -15,6 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from vibrissa.slam.pose_cells import PoseCellError
 from vibrissa.tools.experiment import mapping, recording
 from vibrissa.tools.experiment.cache import key_of, load, store
 from vibrissa.tools.experiment.mapping import MapCase, run_map
@@ -67,7 +68,12 @@ def mapped(folder: Path, rig: RigCase, case: MapCase) -> dict[str, Any]:
     stored = load(folder, map_key(rig, case))
     if stored is not None:
         return _scores_of(stored)
-    trace = run_map(recorded(folder, rig), case)
+    try:
+        trace = run_map(recorded(folder, rig), case)
+    except PoseCellError as error:
+        of = f"{rig.controller}, seed {rig.seed}"
+        where = f"{of}, {case.image}, noise {case.noise}, control {case.control}"
+        raise PoseCellError(f"{where}: {error}") from None
     found = scores(trace)
     store(
         folder,
