@@ -35,6 +35,7 @@ from vibrissa.slam.sequence_config import BATCH, SequenceConfig
 from vibrissa.slam.sequence_filter import Belief, SequenceFilter
 from vibrissa.slam.sequence_memory import WhiskMemory
 from vibrissa.slam.sequence_table import PER_RING, RINGS, WHISKERS, Floats, Ints
+from vibrissa.slam.sequence_trust import Trust
 
 LARGEST_STEP: Final = 1e3
 """m and rad of one odometry step; beyond it something is broken."""
@@ -95,7 +96,8 @@ class SequenceSlam:
         self._at_once = max(1, min(config.decide_every, config.lag // 4))
         self._poses = np.zeros((256, 3))
         self._steps = np.zeros((256, 4))
-        self._turned = np.zeros((256, 2))  # by odometry alone: heading, and its variance
+        self._travelled = np.zeros((256, 4))  # by odometry alone: distance, turn, variances
+        self._trust = Trust()
         self._loops = Loops(
             0,
             np.zeros((256, 2), dtype=np.int64),
@@ -177,9 +179,10 @@ class SequenceSlam:
         reckon(self._poses[whisk], distance, turn)
         sigmas = self.config.odometer.sigmas(distance, turn)
         self._steps[whisk] = distance, turn, *sigmas
-        self._turned = grown(self._turned, whisk + 1)
-        before = self._turned[whisk - 1] if whisk else np.zeros(2)
-        self._turned[whisk] = before[0] + turn, before[1] + sigmas[1] * sigmas[1]
+        self._travelled = grown(self._travelled, whisk + 1)
+        self._travelled[whisk] = distance, turn, sigmas[0] ** 2, sigmas[1] ** 2
+        if whisk:
+            self._travelled[whisk] += self._travelled[whisk - 1]
         loops = self._loops
         loops.label = grown(loops.label, whisk + 1)
         loops.label[whisk] = whisk
@@ -216,7 +219,9 @@ class SequenceSlam:
             n = self._memory.count
             oldest = max(n - 1 - self.config.window, 0)
             ends, facing = self._ordered(self._loops)
-            refine(self._poses[:n], oldest, self._steps[1:n], ends, facing, self._graph)
+            self._trust.look_at(ends, facing, self._travelled)
+            steps = self._trusted(self._trust, oldest)
+            refine(self._poses[:n], oldest, steps, ends, facing, self._graph)
 
     def _find(self, whisk: int, posterior: Floats, loops: Loops) -> NDArray[np.int32]:
         count = find_members(
@@ -239,7 +244,8 @@ class SequenceSlam:
 
         Odometry alone and not the estimate, which is surer of itself than it should be.
         """
-        turn, variance = self._turned[whisk] - self._turned[self._memory.whisk[state]]
+        earlier = self._memory.whisk[state]
+        _, turn, _, variance = self._travelled[whisk] - self._travelled[earlier]
         apart = wrap_pi(float(turn) - math.pi * int(direction))
         heading = self.config.loop_heading
         return apart * apart <= self.config.gate**2 * (float(variance) + heading * heading)
@@ -270,8 +276,10 @@ class SequenceSlam:
         poses = np.zeros((0, 3))
         ends, facing = self._ordered(loops)
         if n:
-            first, steps = self._poses[0], self._steps[1:n]
-            poses = solve_unwound(first, steps, ends, facing, self._graph).poses
+            trust = self._trust.copied()
+            trust.look_at(ends, facing, self._travelled)
+            steps = self._trusted(trust, 0)
+            poses = solve_unwound(self._poses[0], steps, ends, facing, self._graph).poses
         for pose in poses:
             pose[2] = wrap_pi(float(pose[2]))
         chain = np.stack([np.arange(n - 1), np.arange(1, n)], axis=1) if n else ends
@@ -289,6 +297,15 @@ class SequenceSlam:
             found = self._find(whisk, posterior, loops)
             if len(found):
                 loops.add(whisk, found, memory.whisk)
+
+    def _trusted(self, trust: Trust, first: int) -> Floats:
+        """The steps float64[n - 1, 4], from `first` on with what is to be believed of them."""
+        steps = self._steps[1 : self._memory.count]
+        factors = trust.factors
+        if (factors < 1.0).any():
+            steps = steps.copy()
+            steps[first:, 2:] *= factors
+        return steps
 
     @staticmethod
     def _ordered(loops: Loops) -> tuple[Ints, NDArray[np.int8]]:
