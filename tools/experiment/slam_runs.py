@@ -100,8 +100,7 @@ class Variant:
 
 VARIANTS: Final[dict[str, Variant]] = {
     "plain": Variant(share=1.0),
-    "open loop": Variant((("controller", "open_loop"),), 0.5),
-    "wander 4 mm": Variant((("wander", 0.004),)),
+    "open loop": Variant((("controller", "open_loop"),), 0.3),
     "yaw 4 deg, wander 4 mm": Variant((("yaw", math.radians(4.0)), ("wander", 0.004))),
     "kidnapped twice": Variant(kidnapped=True),
     "reversed after every circuit": Variant((("sequence", "CACACACACA"),)),

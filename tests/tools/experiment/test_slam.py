@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from vibrissa.processes.results import silent
+from vibrissa.tools import bench_touch
 from vibrissa.tools.cli import app
 from vibrissa.tools.experiment import slam_report, slam_runs
 from vibrissa.tools.experiment.slam_runs import NOISES, ROWS, VARIANTS, works
@@ -63,3 +65,12 @@ def test_the_table_counts_wins_and_takes_geometric_means() -> None:
 def test_places_as_seen_from_the_first_pose() -> None:
     poses = np.array([[1.0, 2.0, np.pi / 2.0], [1.0, 3.0, 0.0], [0.0, 2.0, 0.0]])
     assert slam_report.from_first(poses) == pytest.approx(np.array([[0, 0], [1, 0], [0, 1]]))
+
+
+def test_the_bench_judges_wins_loops_without_touch_and_cost(tmp_path: Path) -> None:
+    found = bench_touch.bench(tmp_path, 0.0, silent, quick=True)
+    assert {row["row"] for row in found.rows} == {*bench_touch.TOUCH, *bench_touch.CONTROLS}
+    aims = {target.name: target for target in found.targets}
+    assert aims["loops blind or shuffled"].met
+    assert aims["lag 100, processor time per whisk"].value > 0.0
+    assert [t.bound for t in found.targets] == [0.95, 0.95, 0, 5]
