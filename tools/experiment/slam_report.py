@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import signal
@@ -110,11 +111,14 @@ def tabulate(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
                     continue
                 cell: dict[str, Any] = {"group": group, "row": row.name, "noise": noise}
                 cell["n"] = len(chosen)
+                cell["ended"] = sum(bool(run["ended"]) for run in chosen)
                 cell["loops"] = float(np.mean([run["loops"] for run in chosen]))
                 right = [run["right"] for run in chosen if run["right"] is not None]
                 cell["right"] = float(np.mean(right)) if right else None
                 for relations in RELATIONS:
-                    ratios = [run[relations] for run in chosen]
+                    ratios = [run[relations] for run in chosen if run[relations] is not None]
+                    if not ratios:
+                        ratios = [math.nan]
                     logs = summarise(np.log(ratios))
                     cell[relations] = {
                         "ratio": geometric_mean(ratios),
@@ -193,16 +197,17 @@ def page(results: dict[str, Any], figures: Sequence[Figure]) -> str:
                     f"{number(value['ratio'])} [{number(value['low'])}, {number(value['high'])}]"
                 )
                 row += [number(value["worst"]), f"{value['wins']} / {cell['n']}"]
-            rows.append([*row, number(cell["loops"]), number(cell["right"])])
+            rows.append([*row, number(cell["loops"]), number(cell["right"]), str(cell["ended"])])
         head = ["row", "noise"]
         for relations in RELATIONS:
             head += [relations, "worst", "wins"]
-        parts.append(f"<h2>{group}</h2>" + grid([*head, "loops", "right"], rows, 2))
+        parts.append(f"<h2>{group}</h2>" + grid([*head, "loops", "right", "ended early"], rows, 2))
     return (
         "<!doctype html><html lang=en><meta charset=utf-8><title>vibrissa: SLAM by touch</title>"
         f"<style>{STYLE}</style><h1>SLAM by touch against its own odometry</h1><p>Energy Metric of "
         "the whisks in the final map over that of dead reckoning by the same odometry: geometric "
         "mean, bootstrap interval over runs, worst run, runs won. Maze draws differ by run. "
-        "Blind: all images zero; shuffled: whole whisks in random order.</p>"
+        "Ended early: the SLAM gave up, and the run "
+        "counts as not won. Blind: all images zero; shuffled: whole whisks in random order.</p>"
         f"{''.join(parts)}</html>\n"
     )

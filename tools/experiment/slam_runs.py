@@ -23,6 +23,7 @@ from vibrissa.slam.interface import Odometry
 from vibrissa.slam.metrics import energy_metric
 from vibrissa.slam.odometer import OdometerNoise, calibrated
 from vibrissa.slam.odometry import NOISE_MODELS
+from vibrissa.slam.pose_cells import PoseCellError
 from vibrissa.slam.ratslam import RatSlam
 from vibrissa.slam.sequence import SequenceSlam
 from vibrissa.slam.sequence_config import BATCH, SequenceConfig
@@ -169,10 +170,21 @@ def run_work(folder: Path, work: SlamWork) -> list[dict[str, Any]]:
 def run_row(
     recording: Recording, motion: Floats, row: SlamRow, noise: str, seed: int
 ) -> dict[str, Any]:
-    """Energies of a row and of dead reckoning, how many loops there are and how many are right.
+    """Energies of a row over those of dead reckoning, how many loops there are and how many are
+    right; None for what there is not. `ended`: why a SLAM gave up before the end, which it may.
 
     motion float64[n, 3]: the noisy odometry v (m/s), w (rad/s), dt (s).
     """
+    try:
+        return _run_row(recording, motion, row, noise, seed) | {"ended": ""}
+    except PoseCellError as error:
+        none = dict.fromkeys(("right", *RELATIONS))
+        return {"row": row.name, "loops": 0, "ended": str(error), **none}
+
+
+def _run_row(
+    recording: Recording, motion: Floats, row: SlamRow, noise: str, seed: int
+) -> dict[str, Any]:
     reckoned = dead_reckoning(motion)
     links = np.zeros((0, 2), dtype=np.int64)
     if row.kind == "sequence":

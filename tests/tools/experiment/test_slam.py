@@ -51,15 +51,24 @@ def test_every_group_has_fresh_mazes_and_all_noises() -> None:
 
 
 def test_the_table_counts_wins_and_takes_geometric_means() -> None:
-    run = {"group": "plain", "row": ROWS[0].name, "noise": "jit", "loops": 4, "right": 0.5}
+    run = {
+        "group": "plain",
+        "row": ROWS[0].name,
+        "noise": "jit",
+        "loops": 4,
+        "right": 0.5,
+        "ended": "",
+    }
     runs = [
         run | {"consecutive": 0.5, "interval": 1.0, "all": 2.0},
         run | {"consecutive": 0.125, "interval": 0.9995, "all": 0.5, "right": None},
+        run | {"consecutive": None, "interval": None, "all": None, "ended": "lost"},
     ]
     (cell,) = slam_report.tabulate(runs)
     assert cell["consecutive"]["ratio"] == pytest.approx(0.25)
     assert [cell[r]["wins"] for r in ("consecutive", "interval", "all")] == [2, 0, 1]
-    assert (cell["n"], cell["right"], cell["all"]["worst"]) == (2, 0.5, 2.0)
+    assert (cell["n"], cell["ended"], cell["right"]) == (3, 1, 0.5)
+    assert cell["all"]["worst"] == 2.0
 
 
 def test_places_as_seen_from_the_first_pose() -> None:
