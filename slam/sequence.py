@@ -33,6 +33,7 @@ from vibrissa.slam.interface import (
 from vibrissa.slam.sequence_accept import find_members
 from vibrissa.slam.sequence_config import BATCH, SequenceConfig
 from vibrissa.slam.sequence_filter import Belief, SequenceFilter
+from vibrissa.slam.sequence_gate import Reckoning
 from vibrissa.slam.sequence_memory import WhiskMemory
 from vibrissa.slam.sequence_table import PER_RING, RINGS, WHISKERS, Floats, Ints
 from vibrissa.slam.sequence_trust import Trust
@@ -96,7 +97,7 @@ class SequenceSlam:
         self._at_once = max(1, min(config.decide_every, config.lag // 4))
         self._poses = np.zeros((256, 3))
         self._steps = np.zeros((256, 4))
-        self._travelled = np.zeros((256, 4))  # by odometry alone: distance, turn, variances
+        self._reckoning = Reckoning()
         self._trust = Trust()
         self._loops = Loops(
             0,
@@ -179,10 +180,7 @@ class SequenceSlam:
         reckon(self._poses[whisk], distance, turn)
         sigmas = self.config.odometer.sigmas(distance, turn)
         self._steps[whisk] = distance, turn, *sigmas
-        self._travelled = grown(self._travelled, whisk + 1)
-        self._travelled[whisk] = distance, turn, sigmas[0] ** 2, sigmas[1] ** 2
-        if whisk:
-            self._travelled[whisk] += self._travelled[whisk - 1]
+        self._reckoning.add(whisk, self._steps[whisk])
         loops = self._loops
         loops.label = grown(loops.label, whisk + 1)
         loops.label[whisk] = whisk
@@ -219,7 +217,7 @@ class SequenceSlam:
             n = self._memory.count
             oldest = max(n - 1 - self.config.window, 0)
             ends, facing = self._ordered(self._loops)
-            self._trust.look_at(ends, facing, self._travelled)
+            self._trust.look_at(ends, facing, self._reckoning.travelled)
             steps = self._trusted(self._trust, oldest)
             refine(self._poses[:n], oldest, steps, ends, facing, self._graph)
 
@@ -235,20 +233,19 @@ class SequenceSlam:
             self.config.share,
             self._members,
         )
-        if count and not self._can_face(whisk, *self._members[0]):
+        if count and not self._can_be(whisk, *self._members[0]):
             count = 0
         return self._members[:count]
 
-    def _can_face(self, whisk: int, state: int, direction: int) -> bool:
-        """Whether odometry lets a whisk have the heading of the one it repeats.
-
-        Odometry alone and not the estimate, which is surer of itself than it should be.
-        """
-        earlier = self._memory.whisk[state]
-        _, turn, _, variance = self._travelled[whisk] - self._travelled[earlier]
-        apart = wrap_pi(float(turn) - math.pi * int(direction))
-        heading = self.config.loop_heading
-        return apart * apart <= self.config.gate**2 * (float(variance) + heading * heading)
+    def _can_be(self, whisk: int, state: int, direction: int) -> bool:
+        """Whether odometry lets a whisk have the heading and the place of the one it repeats."""
+        config, earlier = self.config, int(self._memory.whisk[state])
+        apart, variance = self._reckoning.heading_apart(whisk, earlier, int(direction))
+        limit = config.gate * config.gate
+        if apart * apart > limit * (variance + config.loop_heading * config.loop_heading):
+            return False
+        chi2 = self._reckoning.place_chi2(whisk, earlier, config.loop_place, config.lateral)
+        return chi2 <= limit
 
     def _forget(self) -> None:
         """Make room in the memory; what is forgotten counts as new from now on."""
@@ -277,7 +274,7 @@ class SequenceSlam:
         ends, facing = self._ordered(loops)
         if n:
             trust = self._trust.copied()
-            trust.look_at(ends, facing, self._travelled)
+            trust.look_at(ends, facing, self._reckoning.travelled)
             steps = self._trusted(trust, 0)
             poses = solve_unwound(self._poses[0], steps, ends, facing, self._graph).poses
         for pose in poses:

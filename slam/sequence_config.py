@@ -32,7 +32,8 @@ class SequenceConfig:
     reach: how far apart the places of a group may be, whisks.
     share: least probability of a member that gets a loop, relative to the best.
     most_loops: members of a group that get a loop, at most.
-    gate: standard deviations by which a loop's heading may differ from what odometry says.
+    gate: standard deviations by which a loop's heading, and its place, may differ from what
+        odometry alone says.
     memory: whisks remembered; when full, half of them are forgotten (see sequence_memory).
     window: whisks whose poses are estimated anew with every loop; older ones change in the map
         alone.
