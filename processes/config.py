@@ -142,14 +142,14 @@ class Arm(Section):
 class Slam(Section):
     """[slam]"""
 
-    algorithm: Annotated[str, Field(description="ratslam, or one that was added")] = "ratslam"
+    algorithm: Annotated[str, Field(description="ratslam, sequence or one added")] = "ratslam"
     image: Annotated[
         Literal["max_angle_gated", "max_angle_ungated", "contact_angle"],
         Field(description="gated: still in contact near full protraction"),
     ] = "max_angle_gated"
     preset: Annotated[str, Field(description="named RatSLAM parameter set")] = "whisker"
     parameters: Annotated[
-        dict[str, float | int | bool], Field(description="OpenRatSLAM parameters over the preset")
+        dict[str, float | int | bool], Field(description="of the algorithm: see docs/slam.md")
     ] = {}
     odometry_noise: Annotated[str, Field(description="named odometry noise model")] = "none"
 
@@ -315,7 +315,7 @@ def _check_parts(experiment: Experiment, where: str) -> None:
         for swap in experiment.swap:
             if swap.node == "arm":
                 make_path(experiment, swap.to)
-        slams.make_slam_config(experiment)
+        slams.check(experiment)
         check(experiment)
         of = experiment.whisk.calibrated_head
         if of not in ("", VIRTUAL_HEAD) and experiment.rig.head == "virtual":

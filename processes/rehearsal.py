@@ -18,6 +18,7 @@ from vibrissa.messages.types import TICK_NS, WHISKERS
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.node import Node, Stepper
 from vibrissa.processes.results import RunError
+from vibrissa.processes.slams import warm
 from vibrissa.processes.table import ROWS, SLAM_SLOTS, SLOTS, build
 
 TICKS = 1600
@@ -42,8 +43,11 @@ def rehearse(name: str, experiment: Experiment, controller: str | None = None) -
         }
     )
     node = build(name, short)
+    algorithm = controller or experiment.slam.algorithm
+    if name == "slam" or name in SLAM_SLOTS:
+        warm(algorithm, experiment)
     if name in SLAM_SLOTS:
-        order = types.Order(0, "assign", name, controller or experiment.slam.algorithm, "", -1, 0)
+        order = types.Order(0, "assign", name, algorithm, "", -1, 0)
         node.step(Message("run.order", "supervisor", 0, 0, 0, order))
     rehearse_node(name, node)
 

@@ -20,6 +20,9 @@ from vibrissa.slam.config import PRESETS, ConfigError, RatSlamConfig
 from vibrissa.slam.interface import Slam
 from vibrissa.slam.odometry import NOISE_MODELS
 from vibrissa.slam.ratslam import RatSlam
+from vibrissa.slam.sequence import SequenceSlam
+from vibrissa.slam.sequence_config import SequenceConfig, sequence_config
+from vibrissa.slam.sequence_rehearsal import rehearse
 
 ENTRY_POINTS: Final = "vibrissa.slams"
 
@@ -33,7 +36,7 @@ def make_slam_config(
     """
     settings = experiment.slam
     changes: dict[str, Any] = dict(parameters or {})
-    own: dict[str, Any] = {} if "preset" in changes else dict(settings.parameters)
+    own = {} if "preset" in changes else _section(experiment, "ratslam")
     preset = changes.pop("preset", settings.preset)
     if preset not in PRESETS:
         raise RunError(f"slam.preset: {preset!r}, expected one of {', '.join(PRESETS)}")
@@ -52,11 +55,51 @@ def make_slam_config(
         raise RunError(f"slam.parameters.{error}") from None
 
 
+def make_sequence_config(
+    experiment: Experiment, parameters: Mapping[str, Any] | None = None
+) -> SequenceConfig:
+    """The sequence SLAM's parameters of an experiment, others over them. Raises RunError."""
+    try:
+        return sequence_config(_section(experiment, "sequence") | dict(parameters or {}))
+    except ValueError as error:
+        raise RunError(f"slam.parameters.{error}") from None
+
+
+def _section(experiment: Experiment, name: str) -> dict[str, Any]:
+    """What `slam.parameters` says to a built-in SLAM: to `sequence` where that is the algorithm,
+    to RatSLAM else."""
+    meant = "sequence" if experiment.slam.algorithm == "sequence" else "ratslam"
+    return dict(experiment.slam.parameters) if name == meant else {}
+
+
+def check(experiment: Experiment) -> None:
+    """Judge an experiment's [slam] section. Raises RunError."""
+    make_slam_config(experiment)
+    make_sequence_config(experiment)
+
+
 def _ratslam(experiment: Experiment, parameters: dict[str, Any]) -> Slam:
     return RatSlam(make_slam_config(experiment, parameters))
 
 
-BUILT_IN: Final[dict[str, Callable[[Experiment, dict[str, Any]], Slam]]] = {"ratslam": _ratslam}
+def _sequence(experiment: Experiment, parameters: dict[str, Any]) -> Slam:
+    return SequenceSlam(make_sequence_config(experiment, parameters))
+
+
+BUILT_IN: Final[dict[str, Callable[[Experiment, dict[str, Any]], Slam]]] = {
+    "ratslam": _ratslam,
+    "sequence": _sequence,
+}
+
+
+COMPILED_LATE: Final[dict[str, Callable[[], object]]] = {"sequence": rehearse}
+"""Built-in SLAMs of which a few steps do not compile everything, and what does."""
+
+
+def warm(name: str, experiment: Experiment) -> None:
+    """Compile what a SLAM would otherwise compile in the middle of a run."""
+    if name not in experiment.slams and name in COMPILED_LATE:
+        COMPILED_LATE[name]()
 
 
 def available(experiment: Experiment) -> dict[str, str]:
@@ -93,6 +136,5 @@ def _target(name: str, experiment: Experiment) -> str:
         return experiment.slams[name]
     for point in importlib.metadata.entry_points(group=ENTRY_POINTS, name=name):
         return point.value
-    known = ", ".join(available(experiment))
     known = ", ".join(available(experiment))
     raise RunError(f"slam {name} is not installed; installed are {known}")

@@ -33,8 +33,10 @@ from vibrissa.slam.interface import (
 from vibrissa.slam.sequence_accept import find_members
 from vibrissa.slam.sequence_config import BATCH, SequenceConfig
 from vibrissa.slam.sequence_filter import Belief, SequenceFilter
+from vibrissa.slam.sequence_gate import Reckoning
 from vibrissa.slam.sequence_memory import WhiskMemory
 from vibrissa.slam.sequence_table import PER_RING, RINGS, WHISKERS, Floats, Ints
+from vibrissa.slam.sequence_trust import Trust
 
 LARGEST_STEP: Final = 1e3
 """m and rad of one odometry step; beyond it something is broken."""
@@ -95,7 +97,8 @@ class SequenceSlam:
         self._at_once = max(1, min(config.decide_every, config.lag // 4))
         self._poses = np.zeros((256, 3))
         self._steps = np.zeros((256, 4))
-        self._turned = np.zeros((256, 2))  # by odometry alone: heading, and its variance
+        self._reckoning = Reckoning()
+        self._trust = Trust()
         self._loops = Loops(
             0,
             np.zeros((256, 2), dtype=np.int64),
@@ -177,9 +180,7 @@ class SequenceSlam:
         reckon(self._poses[whisk], distance, turn)
         sigmas = self.config.odometer.sigmas(distance, turn)
         self._steps[whisk] = distance, turn, *sigmas
-        self._turned = grown(self._turned, whisk + 1)
-        before = self._turned[whisk - 1] if whisk else np.zeros(2)
-        self._turned[whisk] = before[0] + turn, before[1] + sigmas[1] * sigmas[1]
+        self._reckoning.add(whisk, self._steps[whisk])
         loops = self._loops
         loops.label = grown(loops.label, whisk + 1)
         loops.label[whisk] = whisk
@@ -216,7 +217,9 @@ class SequenceSlam:
             n = self._memory.count
             oldest = max(n - 1 - self.config.window, 0)
             ends, facing = self._ordered(self._loops)
-            refine(self._poses[:n], oldest, self._steps[1:n], ends, facing, self._graph)
+            self._trust.look_at(ends, facing, self._reckoning.travelled)
+            steps = self._trusted(self._trust, oldest)
+            refine(self._poses[:n], oldest, steps, ends, facing, self._graph)
 
     def _find(self, whisk: int, posterior: Floats, loops: Loops) -> NDArray[np.int32]:
         count = find_members(
@@ -230,19 +233,19 @@ class SequenceSlam:
             self.config.share,
             self._members,
         )
-        if count and not self._can_face(whisk, *self._members[0]):
+        if count and not self._can_be(whisk, *self._members[0]):
             count = 0
         return self._members[:count]
 
-    def _can_face(self, whisk: int, state: int, direction: int) -> bool:
-        """Whether odometry lets a whisk have the heading of the one it repeats.
-
-        Odometry alone and not the estimate, which is surer of itself than it should be.
-        """
-        turn, variance = self._turned[whisk] - self._turned[self._memory.whisk[state]]
-        apart = wrap_pi(float(turn) - math.pi * int(direction))
-        heading = self.config.loop_heading
-        return apart * apart <= self.config.gate**2 * (float(variance) + heading * heading)
+    def _can_be(self, whisk: int, state: int, direction: int) -> bool:
+        """Whether odometry lets a whisk have the heading and the place of the one it repeats."""
+        config, earlier = self.config, int(self._memory.whisk[state])
+        apart, variance = self._reckoning.heading_apart(whisk, earlier, int(direction))
+        limit = config.gate * config.gate
+        if apart * apart > limit * (variance + config.loop_heading * config.loop_heading):
+            return False
+        chi2 = self._reckoning.place_chi2(whisk, earlier, config.loop_place, config.lateral)
+        return chi2 <= limit
 
     def _forget(self) -> None:
         """Make room in the memory; what is forgotten counts as new from now on."""
@@ -270,8 +273,10 @@ class SequenceSlam:
         poses = np.zeros((0, 3))
         ends, facing = self._ordered(loops)
         if n:
-            first, steps = self._poses[0], self._steps[1:n]
-            poses = solve_unwound(first, steps, ends, facing, self._graph).poses
+            trust = self._trust.copied()
+            trust.look_at(ends, facing, self._reckoning.travelled)
+            steps = self._trusted(trust, 0)
+            poses = solve_unwound(self._poses[0], steps, ends, facing, self._graph).poses
         for pose in poses:
             pose[2] = wrap_pi(float(pose[2]))
         chain = np.stack([np.arange(n - 1), np.arange(1, n)], axis=1) if n else ends
@@ -289,6 +294,15 @@ class SequenceSlam:
             found = self._find(whisk, posterior, loops)
             if len(found):
                 loops.add(whisk, found, memory.whisk)
+
+    def _trusted(self, trust: Trust, first: int) -> Floats:
+        """The steps float64[n - 1, 4], from `first` on with what is to be believed of them."""
+        steps = self._steps[1 : self._memory.count]
+        factors = trust.factors
+        if (factors < 1.0).any():
+            steps = steps.copy()
+            steps[first:, 2:] *= factors
+        return steps
 
     @staticmethod
     def _ordered(loops: Loops) -> tuple[Ints, NDArray[np.int8]]:

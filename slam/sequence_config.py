@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Final
 
 from vibrissa.slam.config import ConfigError
+from vibrissa.slam.interface import SlamInputError
 from vibrissa.slam.odometer import OdometerNoise
 
 BATCH: Final = -1
@@ -30,7 +32,8 @@ class SequenceConfig:
     reach: how far apart the places of a group may be, whisks.
     share: least probability of a member that gets a loop, relative to the best.
     most_loops: members of a group that get a loop, at most.
-    gate: standard deviations by which a loop's heading may differ from what odometry says.
+    gate: standard deviations by which a loop's heading, and its place, may differ from what
+        odometry alone says.
     memory: whisks remembered; when full, half of them are forgotten (see sequence_memory).
     window: whisks whose poses are estimated anew with every loop; older ones change in the map
         alone.
@@ -110,3 +113,26 @@ _RANGES: Final[dict[str, tuple[float, float]]] = {
     "loop_heading": (1e-6, 10.0),
     "robust": (1e-3, 1e6),
 }
+ODOMETER: Final = "odometer_"
+"""Prefix of the fields of `odometer` where parameters are plain names and numbers."""
+
+
+def sequence_config(parameters: Mapping[str, Any]) -> SequenceConfig:
+    """A configuration from plain names and numbers: lag=30, odometer_turn=0.05.
+
+    Raises ConfigError for an unknown name and a value out of range.
+    """
+    own = {f.name for f in fields(SequenceConfig)} - {"odometer"}
+    noise = {ODOMETER + f.name: f.name for f in fields(OdometerNoise)}
+    for name, value in parameters.items():
+        if name not in own and name not in noise:
+            known = ", ".join(sorted([*own, *noise]))
+            raise ConfigError(f"{name}: no such parameter of the sequence SLAM; there are {known}")
+        if name in noise and (isinstance(value, bool) or not isinstance(value, (int, float))):
+            raise ConfigError(f"{name}: expected a number, found {value!r}")
+    try:
+        odometer = OdometerNoise(**{noise[k]: v for k, v in parameters.items() if k in noise})
+    except SlamInputError as error:
+        raise ConfigError(str(error).replace("odometer ", ODOMETER, 1)) from None
+    changes: dict[str, Any] = {k: v for k, v in parameters.items() if k in own}
+    return SequenceConfig(**changes, odometer=odometer)

@@ -116,7 +116,7 @@ def bench(
     quick: Annotated[
         bool,
         typer.Option(
-            "--quick", help="Small sizes, to see that a bench works (slam, rig, devices)."
+            "--quick", help="Small sizes, to see that a bench works (slam, touch, rig, devices)."
         ),
     ] = False,
     swaps: Annotated[

@@ -19,6 +19,7 @@ from vibrissa.slam.sequence import SequenceSlam
 from vibrissa.slam.sequence_config import SequenceConfig
 from vibrissa.tools.bench import Bench, Target
 from vibrissa.tools.experiment.design import CONTACT_ANGLE
+from vibrissa.tools.experiment.mapping import noisy
 from vibrissa.tools.experiment.recording import Recording
 from vibrissa.tools.experiment.scores import RELATIONS
 from vibrissa.tools.experiment.slam_report import tabulate
@@ -34,17 +35,24 @@ CONTROLS: Final = (
 )
 
 
-def bench(out: Path, seconds: float, on_progress: OnProgress) -> Bench:
-    """Two seeds in two mazes each under three odometry noises; `seconds` is not looked at."""
-    wanted = [work for work in works(SEEDS, quick=False) if work.group == "plain"]
+def bench(out: Path, seconds: float, on_progress: OnProgress, *, quick: bool = False) -> Bench:
+    """Two seeds in two mazes each under three odometry noises; `seconds` is not looked at.
+
+    quick: one short data set, to see that it works.
+    """
+    wanted = [work for work in works(SEEDS, quick) if work.group == "plain"]
+    wanted = wanted[:1] if quick else wanted
     rows = [row for row in ROWS if row.name in (*TOUCH, *CONTROLS)]
     runs: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as cache:
         for done, work in enumerate(wanted):
             on_progress(Progress(work.noise, float(done), float(len(wanted))))
             recording = recorded(Path(cache), work.rig)
+            motion = noisy(recording, work.noise, work.rig.seed)
             labels = {"group": work.group, "noise": work.noise, "seed": work.rig.seed}
-            runs += [labels | run_row(recording, r, work.noise, work.rig.seed) for r in rows]
+            runs += [
+                labels | run_row(recording, motion, row, work.noise, work.rig.seed) for row in rows
+            ]
         cost = milliseconds(recording, work.noise, work.rig.seed)
     table = tabulate(runs)
     targets = []

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from tests.slam.sequence_world import PLACES, World, drive, image_of, make_world
+from tests.slam.sequence_world import PLACES, STEP, World, drive, image_of, make_world
 from vibrissa.numerics import cos, sin
 from vibrissa.slam.angles import wrap_pi
 from vibrissa.slam.config import ConfigError
@@ -233,3 +233,23 @@ def test_impossible_parameters_are_refused_by_name(
 ) -> None:
     with pytest.raises(ConfigError, match=message):
         config(**changes)
+
+
+@pytest.mark.parametrize("lag", LAGS)
+@pytest.mark.parametrize("period", [6, 18, 45])
+def test_in_a_corridor_for_ever_whose_walls_repeat_it_is_no_worse_than_the_odometry(
+    lag: int, period: int
+) -> None:
+    """Posts at equal distances feel the same; nothing is ever met again."""
+    rng = np.random.default_rng(period)
+    n = 1200
+    walls = np.repeat(rng.integers(0, 1 << 18, period), 3)[:period]
+    flips = (rng.random((n, 18)) < 0.02) @ (1 << np.arange(18))
+    masks = np.resize(walls, n) ^ flips
+    motion = np.tile([STEP, 0.0], (n, 1))
+    truth = np.cumsum(np.hstack([motion, np.zeros((n, 1))]), axis=0)
+    motion = motion + rng.normal(size=motion.shape) * [0.002, 0.02]
+    world = World(masks, motion, truth, np.arange(n))
+    slam, _ = drive(world, config(lag=lag))
+    ratio = energies(slam.map().poses, world) / energies(reckoned(world), world)
+    assert (ratio < 1.05).all()

@@ -17,29 +17,34 @@ def experiment(
     name: Annotated[
         str, typer.Argument(help="`paper`: Salman and Pearson's experiment; `slam`: SLAM by touch.")
     ],
-    seeds: Annotated[int, typer.Option(min=1, max=1000, help="Runs of the whole.")] = 5,
+    seeds: Annotated[
+        int, typer.Option(min=1, max=1000, help="Runs of the whole (slam: in two mazes each).")
+    ] = 5,
     jobs: Annotated[int, typer.Option(min=0, help="Processes; 0: one per core.")] = 0,
     out: Annotated[
-        Path, typer.Option(help="Directory for results.json, report.html and the cache.")
-    ] = Path("runs/paper"),
+        Path | None,
+        typer.Option(help="Directory for results.json, report.html and the cache: runs/NAME."),
+    ] = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="A fast head and fewer circuits: a look, no claim.")
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Reproduce the paper: open loop against RCP, max angle against contact angle, with controls.
+    """Reproduce the paper (open loop against RCP, max angle against contact angle, with controls),
+    or set SLAMs by touch against their own odometry.
 
     An interrupted run goes on where it stopped; what is in the cache is not run again.
     """
     if name not in ("paper", "slam"):
         raise typer.BadParameter(f"no experiment {name!r}; there are `paper` and `slam`")
+    folder = out or Path("runs") / name
     if name == "slam":
-        _slam(seeds, quick, jobs or len(os.sched_getaffinity(0)), out, as_json)
+        _slam(seeds, quick, jobs or len(os.sched_getaffinity(0)), folder, as_json)
         return
     from vibrissa.tools.experiment.design import NOISE, scale
     from vibrissa.tools.experiment.paper import run_paper
 
-    results = run_paper(scale(seeds, quick), jobs or len(os.sched_getaffinity(0)), out)
+    results = run_paper(scale(seeds, quick), jobs or len(os.sched_getaffinity(0)), folder)
     if as_json:
         print_json(results)
         return
@@ -50,7 +55,7 @@ def experiment(
                 f"{row['effect']}: {row['score']} {row['a']:.4g} -> {row['b']:.4g} "
                 f"({row['up']} up, {row['down']} down of {row['n']}): {row['reading']}"
             )
-    console.print(f"{out / 'report.html'}  {results['timing']['wall_s']:.0f} s")
+    console.print(f"{folder / 'report.html'}  {results['timing']['wall_s']:.0f} s")
 
 
 def _slam(seeds: int, quick: bool, jobs: int, out: Path, as_json: bool) -> None:

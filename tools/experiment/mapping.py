@@ -58,7 +58,7 @@ def run_map(recording: Recording, case: MapCase) -> Trace:
     images = _images(recording, case)
     motion = noisy(recording, case.noise, case.seed)
     if case.skips:
-        kept = _kept(recording, case.skips)
+        kept = kept_whisks(recording, case.skips)
         recording, images, motion = recording.chosen(kept), images[kept], motion[kept]
     config = replace(
         PRESETS["whisker"], vt_match_threshold=case.threshold, pc_vt_inject_energy=case.inject
@@ -105,7 +105,9 @@ def _images(recording: Recording, case: MapCase) -> NDArray[np.uint8]:
     return images
 
 
-def _kept(recording: Recording, skips: tuple[tuple[int, float, float], ...]) -> NDArray[np.bool_]:
+def kept_whisks(
+    recording: Recording, skips: tuple[tuple[int, float, float], ...]
+) -> NDArray[np.bool_]:
     """The whisks that are left when every skip is cut out."""
     distance = recording.motion[:, 0] * recording.motion[:, 2]
     kept = np.ones(len(recording), dtype=np.bool_)

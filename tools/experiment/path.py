@@ -25,7 +25,8 @@ Ints = NDArray[np.int64]
 SPEED_STREAM: Final = 2000
 PAUSE_STREAM: Final = 2001
 WANDER_STREAM: Final = 2100
-"""Noise streams of the path; wander has one per circuit from here on."""
+YAW_STREAM: Final = 2200
+"""Noise streams of the path; wander and yaw have one per circuit from here on."""
 SPEED_SPREAD: Final = 0.02
 LONGEST_PAUSE: Final = 1.0
 """s, at the end of a circuit."""
@@ -38,11 +39,13 @@ NS: Final = 1e9
 
 @dataclass(frozen=True)
 class PathParams:
-    """sequence: one letter per circuit, C or A; speed: m/s; wander: m, standard deviation."""
+    """sequence: one letter per circuit, C or A; speed: m/s; wander: m, and yaw: rad, standard
+    deviations of the lateral wander and of the heading's."""
 
     sequence: str
     speed: float
     wander: float
+    yaw: float = 0.0
 
 
 class CircuitPath:
@@ -76,11 +79,15 @@ class CircuitPath:
         self._knots = params.wander * np.stack(
             [_wander(seed, WANDER_STREAM + k, longest) for k in range(circuits)]
         )
+        self._yaw = params.yaw * np.stack(
+            [_wander(seed, YAW_STREAM + k, longest) for k in range(circuits)]
+        )
 
     def poses(self, t_ns: Ints) -> Floats:
         """Poses float64[n, 4] (x, y, z m, yaw rad) at times int64[n], ns since departure."""
         poses = self._path.poses(t_ns)
-        _displace(np.asarray(t_ns, dtype=np.int64), self._starts, self.ends_ns, self._knots, poses)
+        times = np.asarray(t_ns, dtype=np.int64)
+        _displace(times, self._starts, self.ends_ns, self._knots, self._yaw, poses)
         return poses
 
 
@@ -98,8 +105,10 @@ def _wander(seed: int, stream: int, count: int) -> Floats:
 
 
 @compiled
-def _displace(times: Ints, starts: Ints, ends: Ints, knots: Floats, poses: Floats) -> None:
-    """Move every pose to the left of where it faces by the wander at its time."""
+def _displace(
+    times: Ints, starts: Ints, ends: Ints, knots: Floats, yaws: Floats, poses: Floats
+) -> None:
+    """Move every pose to the left of where it faces by the wander at its time, then turn it."""
     circuits = starts.shape[0]
     for j in range(times.shape[0]):
         k = 0
@@ -113,7 +122,9 @@ def _displace(times: Ints, starts: Ints, ends: Ints, knots: Floats, poses: Float
         second = int(since)
         part = since - second
         offset = knots[k, second] + (knots[k, second + 1] - knots[k, second]) * part
-        offset *= edge * edge * (3.0 - 2.0 * edge)
+        smooth = edge * edge * (3.0 - 2.0 * edge)
+        offset *= smooth
         yaw = poses[j, 3]
         poses[j, 0] -= offset * sin(yaw)
         poses[j, 1] += offset * cos(yaw)
+        poses[j, 3] += smooth * (yaws[k, second] + (yaws[k, second + 1] - yaws[k, second]) * part)

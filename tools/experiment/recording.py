@@ -35,7 +35,7 @@ class RigCase:
 
     taper: tip diameters over the usual ones (capped at a cylinder); servo: N m/rad, motor
     stiffness; noise: ratio of the deflection sensors' noise; gain: of RCP, in contact stiffnesses;
-    speed: m/s of the head; wander: m.
+    speed: m/s of the head; wander: m; yaw: rad.
     """
 
     maze: str
@@ -49,6 +49,7 @@ class RigCase:
     noise: float = 1.0
     gain: float = 3.0
     calibration_cycles: int = 12
+    yaw: float = 0.0
 
     def key(self) -> dict[str, Any]:
         """The case as plain values."""
@@ -106,7 +107,9 @@ def plant_params(case: RigCase) -> HeadPlantParams:
 def make_setup(case: RigCase) -> tuple[Setup, CircuitPath]:
     """The whisk loop's setup for a case, and the path in it."""
     maze = parse_maze(case.maze, "experiment")
-    path = CircuitPath(maze, PathParams(case.sequence, case.speed, case.wander), case.seed)
+    path = CircuitPath(
+        maze, PathParams(case.sequence, case.speed, case.wander, case.yaw), case.seed
+    )
     whisk = full_whisk(paper_head(), PERIOD_TICKS, LEAST_SLEW_LIMIT)
     parameters = {} if case.controller == "open_loop" else {"gain": case.gain}
     calibrating = case.calibration_cycles * PERIOD_TICKS

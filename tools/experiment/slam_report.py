@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import signal
@@ -12,11 +13,24 @@ from typing import Any, Final
 
 import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
+from vibrissa.numerics import cos, sin
 from vibrissa.tools.console import note, write_json
+from vibrissa.tools.experiment.cache import load
+from vibrissa.tools.experiment.mapping import noisy
 from vibrissa.tools.experiment.report import STYLE, grid, number, picture
-from vibrissa.tools.experiment.scores import RELATIONS
-from vibrissa.tools.experiment.slam_runs import NOISES, ROWS, run_work, works
+from vibrissa.tools.experiment.scores import RELATIONS, dead_reckoning
+from vibrissa.tools.experiment.slam_runs import (
+    NOISES,
+    ROWS,
+    SlamWork,
+    odometer,
+    run_work,
+    sequence_map,
+    work_key,
+    works,
+)
 from vibrissa.tools.experiment.statistics import geometric_mean, summarise
 from vibrissa.tools.experiment.tasks import recorded, rig_key
 from vibrissa.tools.machine import machine
@@ -27,35 +41,58 @@ SHOWN: Final = ("sequence, batch", "sequence, lag 100", "sequence, past only")
 
 
 def run_slam(seeds: int, quick: bool, jobs: int, out: Path) -> dict[str, Any]:
-    """Run, write results.json and report.html into `out`; the results."""
+    """Run what the cache lacks, write results.json and report.html into `out`; the results."""
     folder = out / "cache"
     folder.mkdir(parents=True, exist_ok=True)
     wanted = works(seeds, quick)
-    rigs = {rig_key(work.rig): work.rig for work in wanted}
-    runs: list[dict[str, Any]] = []
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, context, initializer=_prepare) as pool:
-        making = [pool.submit(_make, folder, rig) for rig in rigs.values()]
-        for k, done in enumerate(as_completed(making)):
-            done.result()
-            note(f"data set {k + 1} of {len(making)}")
-        running = [pool.submit(run_work, folder, work) for work in wanted]
-        for k, finished in enumerate(running):
-            runs += finished.result()
-            note(f"maps {k + 1} of {len(running)}")
-    results = {"table": tabulate(runs), "runs": runs, "machine": machine(), "seeds": seeds}
+    run_all(folder, wanted, jobs)
+    runs = [row for work in wanted for row in run_work(folder, work)]
+    table = tabulate(runs)
+    results = {"table": table, "runs": runs, "machine": machine(), "seeds": seeds}
     write_json(out / "results.json", results)
-    (out / "report.html").write_text(page(results))
+    drawn = [front(table), *(maps(folder, work) for work in wanted[: len(NOISES)])]
+    (out / "report.html").write_text(page(results, drawn))
     return results
+
+
+def run_all(folder: Path, wanted: Sequence[SlamWork], jobs: int) -> None:
+    """Do what is not in the cache, a data set at a time, over `jobs` processes.
+
+    What was finished before an interrupt is kept.
+    """
+    sets: dict[str, list[SlamWork]] = {}
+    for work in wanted:
+        if load(folder, work_key(work)) is None:
+            sets.setdefault(rig_key(work.rig), []).append(work)
+    note(f"{len(sets)} data sets to go")
+    if jobs == 1:
+        for k, works_ in enumerate(sets.values()):
+            _do(folder, works_)
+            note(f"data set {k + 1} of {len(sets)}: {works_[0].group}")
+        return
+    context = multiprocessing.get_context("spawn")
+    others = set(multiprocessing.active_children())
+    with ProcessPoolExecutor(jobs, context, initializer=_prepare) as pool:
+        try:
+            doing = {pool.submit(_do, folder, works_): works_ for works_ in sets.values()}
+            for k, done in enumerate(as_completed(doing)):
+                done.result()
+                note(f"data set {k + 1} of {len(sets)}: {doing[done][0].group}")
+        except BaseException:
+            for child in set(multiprocessing.active_children()) - others:
+                child.terminate()  # what it was writing never appears in the cache
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 def _prepare() -> None:
     os.nice(5)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
 
 
-def _make(folder: Path, rig: Any) -> None:
-    recorded(folder, rig)
+def _do(folder: Path, works_: Sequence[SlamWork]) -> None:
+    for work in works_:
+        run_work(folder, work)
 
 
 def tabulate(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -74,11 +111,14 @@ def tabulate(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
                     continue
                 cell: dict[str, Any] = {"group": group, "row": row.name, "noise": noise}
                 cell["n"] = len(chosen)
+                cell["ended"] = sum(bool(run["ended"]) for run in chosen)
                 cell["loops"] = float(np.mean([run["loops"] for run in chosen]))
                 right = [run["right"] for run in chosen if run["right"] is not None]
                 cell["right"] = float(np.mean(right)) if right else None
                 for relations in RELATIONS:
-                    ratios = [run[relations] for run in chosen]
+                    ratios = [run[relations] for run in chosen if run[relations] is not None]
+                    if not ratios:
+                        ratios = [math.nan]
                     logs = summarise(np.log(ratios))
                     cell[relations] = {
                         "ratio": geometric_mean(ratios),
@@ -114,10 +154,39 @@ def front(table: Sequence[dict[str, Any]]) -> Figure:
     return figure
 
 
-def page(results: dict[str, Any]) -> str:
+def maps(folder: Path, work: SlamWork) -> Figure:
+    """The truth, dead reckoning, and the sequence SLAM's final map of a data set."""
+    recording = recorded(folder, work.rig)
+    motion = noisy(recording, work.noise, work.rig.seed)
+    noise = odometer(work.noise, work.rig.seed)
+    ways = {"dead reckoning": dead_reckoning(motion)}
+    for row in ROWS:
+        if row.name in SHOWN[:2]:
+            ways[row.name] = sequence_map(recording, motion, row, noise, work.rig.seed)[0]
+    figure = Figure(figsize=(11.0, 3.4), layout="constrained")
+    for k, (name, poses) in enumerate(ways.items()):
+        ax = figure.add_subplot(1, len(ways), k + 1)
+        for what, shown in (("truth", recording.truth), (name, poses)):
+            x, y = from_first(shown).T
+            ax.plot(x, y, lw=0.6, label=what)
+        ax.set_aspect("equal", "datalim")
+        ax.set_title(f"{name}, {work.noise}", fontsize=9)
+        ax.set_xlabel("m")
+    return figure
+
+
+def from_first(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Places float64[n, 2] as seen from pose 0 of poses float64[n, 3]."""
+    x, y, heading = poses[0]
+    c, s = float(cos(heading)), float(sin(heading))
+    ahead, left = poses[:, 0] - x, poses[:, 1] - y
+    return np.stack([c * ahead + s * left, c * left - s * ahead], axis=1)
+
+
+def page(results: dict[str, Any], figures: Sequence[Figure]) -> str:
     """The report, one HTML file."""
     table = results["table"]
-    parts = [picture(front(table))]
+    parts = [picture(figure) for figure in figures]
     for group in dict.fromkeys(cell["group"] for cell in table):
         rows = []
         for cell in (c for c in table if c["group"] == group):
@@ -128,16 +197,17 @@ def page(results: dict[str, Any]) -> str:
                     f"{number(value['ratio'])} [{number(value['low'])}, {number(value['high'])}]"
                 )
                 row += [number(value["worst"]), f"{value['wins']} / {cell['n']}"]
-            rows.append([*row, number(cell["loops"]), number(cell["right"])])
+            rows.append([*row, number(cell["loops"]), number(cell["right"]), str(cell["ended"])])
         head = ["row", "noise"]
         for relations in RELATIONS:
             head += [relations, "worst", "wins"]
-        parts.append(f"<h2>{group}</h2>" + grid([*head, "loops", "right"], rows, 2))
+        parts.append(f"<h2>{group}</h2>" + grid([*head, "loops", "right", "ended early"], rows, 2))
     return (
         "<!doctype html><html lang=en><meta charset=utf-8><title>vibrissa: SLAM by touch</title>"
         f"<style>{STYLE}</style><h1>SLAM by touch against its own odometry</h1><p>Energy Metric of "
         "the whisks in the final map over that of dead reckoning by the same odometry: geometric "
         "mean, bootstrap interval over runs, worst run, runs won. Maze draws differ by run. "
-        "Blind: all images zero; shuffled: whole whisks in random order.</p>"
+        "Ended early: the SLAM gave up, and the run "
+        "counts as not won. Blind: all images zero; shuffled: whole whisks in random order.</p>"
         f"{''.join(parts)}</html>\n"
     )

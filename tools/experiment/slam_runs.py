@@ -18,15 +18,18 @@ from numpy.typing import NDArray
 from vibrissa.numerics import philox_normal, philox_uniform
 from vibrissa.rig.maze import format_maze
 from vibrissa.rig.maze_random import random_maze
+from vibrissa.slam.config import PRESETS
 from vibrissa.slam.interface import Odometry
 from vibrissa.slam.metrics import energy_metric
 from vibrissa.slam.odometer import OdometerNoise, calibrated
 from vibrissa.slam.odometry import NOISE_MODELS
+from vibrissa.slam.pose_cells import PoseCellError
+from vibrissa.slam.ratslam import RatSlam
 from vibrissa.slam.sequence import SequenceSlam
 from vibrissa.slam.sequence_config import BATCH, SequenceConfig
 from vibrissa.tools.experiment.cache import key_of, load, store
 from vibrissa.tools.experiment.design import CONTACT_ANGLE, MAX_ANGLE, SEQUENCE
-from vibrissa.tools.experiment.mapping import SHUFFLE_STREAM, MapCase, noisy, run_map
+from vibrissa.tools.experiment.mapping import SHUFFLE_STREAM, MapCase, kept_whisks, noisy
 from vibrissa.tools.experiment.recording import Recording, RigCase
 from vibrissa.tools.experiment.scores import RELATIONS, dead_reckoning, relation_pairs
 from vibrissa.tools.experiment.tasks import recorded, rig_key
@@ -72,6 +75,41 @@ ROWS: Final = (
 )
 
 
+FEWER: Final = (
+    "sequence, batch",
+    "sequence, lag 100",
+    "sequence, past only",
+    "sequence, batch, max angle",
+    "sequence, lag 100, shuffled",
+    "RatSLAM, contact angle",
+    "no touch: turns below 0.3 rad are none",
+)
+"""Rows of the groups besides `plain`."""
+KIDNAPS: Final = ((4, 0.9, 1.2), (8, 0.4, 0.6))
+"""Circuit, m from its start, m: stretches over which the head is carried unawares."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A cell of the table: what is changed of the rig, which share of the seeds it is run with."""
+
+    rig: tuple[tuple[str, Any], ...] = ()
+    share: float = 0.2
+    cells: tuple[int, int] = (7, 5)
+    kidnapped: bool = False
+
+
+VARIANTS: Final[dict[str, Variant]] = {
+    "plain": Variant(share=1.0),
+    "open loop": Variant((("controller", "open_loop"),), 0.3),
+    "yaw 4 deg, wander 4 mm": Variant((("yaw", math.radians(4.0)), ("wander", 0.004))),
+    "kidnapped twice": Variant(kidnapped=True),
+    "reversed after every circuit": Variant((("sequence", "CACACACACA"),)),
+    "9 x 7 cells": Variant(cells=(9, 7)),
+    "20 mm per whisk": Variant((("speed", 0.02),)),
+}
+
+
 @dataclass(frozen=True)
 class SlamWork:
     """A data set (`group`: its cell of the table) under one odometry noise: all rows."""
@@ -80,54 +118,79 @@ class SlamWork:
     rig: RigCase
     noise: str
 
+    @property
+    def rows(self) -> tuple[SlamRow, ...]:
+        return tuple(row for row in ROWS if self.group == "plain" or row.name in FEWER)
+
 
 def works(seeds: int, quick: bool) -> list[SlamWork]:
-    """All data sets: plain, and variants of path, speed and control; mazes of their own."""
-    variants: dict[str, dict[str, Any]] = {
-        "plain": {},
-        "open loop": {"controller": "open_loop"},
-        "wander 4 mm": {"wander": 0.004},
-        "20 mm per whisk": {"speed": 0.02},
-    }
+    """All data sets: plain, and variants of path, maze, speed and control; every data set has a
+    maze of its own. quick: plain alone, with a fast head and fewer circuits."""
     found = []
-    for group, change in variants.items():
-        for seed in range(FIRST_SEED, FIRST_SEED + seeds):
+    for group, variant in VARIANTS.items():
+        if quick and group != "plain":
+            continue
+        for seed in range(FIRST_SEED, FIRST_SEED + max(1, round(variant.share * seeds))):
             for name, (ring, inner) in MAZES.items():
-                maze = format_maze(random_maze(7, 5, 1000 * seed + ord(name), ring, inner))
-                rig = RigCase(maze, seed, "rcp", "CCA" if quick else SEQUENCE)
-                found += [SlamWork(group, replace(rig, **change), noise) for noise in NOISES]
-        if quick:
-            break
+                drawn = random_maze(*variant.cells, 1000 * seed + ord(name), ring, inner)
+                rig = RigCase(format_maze(drawn), seed, "rcp", SEQUENCE)
+                rig = replace(rig, **dict(variant.rig))
+                if quick:
+                    rig = replace(rig, sequence="CCA", speed=0.04)
+                found += [SlamWork(group, rig, noise) for noise in NOISES]
     return found
+
+
+def work_key(work: SlamWork) -> str:
+    """Under which the rows of a data set are kept."""
+    rows = [asdict(row) for row in work.rows]
+    return key_of("slam", {**asdict(work), "rows": rows}, __file__, rig_key(work.rig))
 
 
 def run_work(folder: Path, work: SlamWork) -> list[dict[str, Any]]:
     """All rows of a data set under a noise, from the cache or else made now."""
-    key = key_of("slam", {**asdict(work), "rows": [asdict(row) for row in ROWS]}, __file__)
-    stored = load(folder, f"{key}-{rig_key(work.rig)}")
-    if stored is None:
-        recording = recorded(folder, work.rig)
-        rows = [
-            {"group": work.group, "noise": work.noise, "seed": work.rig.seed}
-            | run_row(recording, row, work.noise, work.rig.seed)
-            for row in ROWS
-        ]
-        store(folder, f"{key}-{rig_key(work.rig)}", {"rows": np.array(json.dumps(rows))})
-        return rows
-    found: list[dict[str, Any]] = json.loads(str(stored["rows"]))
-    return found
+    stored = load(folder, work_key(work))
+    if stored is not None:
+        found: list[dict[str, Any]] = json.loads(str(stored["rows"]))
+        return found
+    recording = recorded(folder, work.rig)
+    motion = noisy(recording, work.noise, work.rig.seed)
+    if VARIANTS[work.group].kidnapped:
+        kept = kept_whisks(recording, KIDNAPS)
+        recording, motion = recording.chosen(kept), motion[kept]
+    labels = {"group": work.group, "noise": work.noise, "seed": work.rig.seed}
+    labels |= {"maze": key_of("maze", {"maze": work.rig.maze}, __file__)[:12]}
+    rows = [
+        labels | run_row(recording, motion, row, work.noise, work.rig.seed) for row in work.rows
+    ]
+    store(folder, work_key(work), {"rows": np.array(json.dumps(rows))})
+    return rows
 
 
-def run_row(recording: Recording, row: SlamRow, noise: str, seed: int) -> dict[str, Any]:
-    """Energies of a row and of dead reckoning, how many loops there are and how many are right."""
-    motion = noisy(recording, noise, seed)
+def run_row(
+    recording: Recording, motion: Floats, row: SlamRow, noise: str, seed: int
+) -> dict[str, Any]:
+    """Energies of a row over those of dead reckoning, how many loops there are and how many are
+    right; None for what there is not. `ended`: why a SLAM gave up before the end, which it may.
+
+    motion float64[n, 3]: the noisy odometry v (m/s), w (rad/s), dt (s).
+    """
+    try:
+        return _run_row(recording, motion, row, noise, seed) | {"ended": ""}
+    except PoseCellError as error:
+        none = dict.fromkeys(("right", *RELATIONS))
+        return {"row": row.name, "loops": 0, "ended": str(error), **none}
+
+
+def _run_row(
+    recording: Recording, motion: Floats, row: SlamRow, noise: str, seed: int
+) -> dict[str, Any]:
     reckoned = dead_reckoning(motion)
     links = np.zeros((0, 2), dtype=np.int64)
     if row.kind == "sequence":
-        poses, links = _sequence(recording, row, motion, odometer(noise, seed), seed)
+        poses, links = sequence_map(recording, motion, row, odometer(noise, seed), seed)
     elif row.kind == "ratslam":
-        trace = run_map(recording, MapCase(row.image, seed, noise, row.control))  # type: ignore[arg-type]
-        poses = trace.map_poses[trace.experience]
+        poses = _ratslam(recording, motion, row, seed)
     else:
         straightened = motion.copy()
         straightened[np.abs(motion[:, 1] * motion[:, 2]) < SMALL_TURN, 1] = 0.0
@@ -161,17 +224,35 @@ def odometer(noise: str, seed: int) -> OdometerNoise:
     return calibrated(*segments)
 
 
-def _sequence(
-    recording: Recording, row: SlamRow, motion: Floats, noise: OdometerNoise, seed: int
+def sequence_map(
+    recording: Recording, motion: Floats, row: SlamRow, noise: OdometerNoise, seed: int
 ) -> tuple[Floats, NDArray[np.int64]]:
-    images = recording.image(row.image)
-    if row.control == "blind":
-        images = np.zeros_like(images)
-    elif row.control == "shuffled":
-        draws = [philox_uniform(seed, SHUFFLE_STREAM, k) for k in range(len(images))]
-        images = images[np.argsort(np.array(draws), kind="stable")]
+    """The whisks' poses float64[n, 3] in the final map, and its loops int64[m, 2]."""
     slam = SequenceSlam(SequenceConfig(lag=row.lag, odometer=noise))
-    for image, (v, w, dt) in zip(images, motion.tolist(), strict=True):
+    for image, (v, w, dt) in zip(_images(recording, row, seed), motion.tolist(), strict=True):
         slam.step(image, Odometry(v, w, dt))
     found = slam.map()
     return found.poses, found.links[len(recording) - 1 :].astype(np.int64)
+
+
+def _ratslam(recording: Recording, motion: Floats, row: SlamRow, seed: int) -> Floats:
+    case = MapCase(row.image, seed)
+    config = replace(
+        PRESETS["whisker"], vt_match_threshold=case.threshold, pc_vt_inject_energy=case.inject
+    )
+    slam = RatSlam(config)
+    at = [
+        slam.step(image, Odometry(v, w, dt)).experience
+        for image, (v, w, dt) in zip(_images(recording, row, seed), motion.tolist(), strict=True)
+    ]
+    return slam.map().poses[at]
+
+
+def _images(recording: Recording, row: SlamRow, seed: int) -> NDArray[np.uint8]:
+    images = np.ascontiguousarray(recording.image(row.image))
+    if row.control == "blind":
+        return np.zeros_like(images)
+    if row.control == "shuffled":
+        draws = [philox_uniform(seed, SHUFFLE_STREAM, k) for k in range(len(images))]
+        return images[np.argsort(np.array(draws), kind="stable")]
+    return images

@@ -1,0 +1,134 @@
+"""The sequence SLAM as the run's SLAM: chosen, swapped with RatSLAM, logged and re-run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.processes.test_swap_between_cycles import said
+from vibrissa.processes.config import Experiment, load_experiment
+from vibrissa.processes.results import RunError
+from vibrissa.processes.simulate import simulate
+from vibrissa.processes.slams import make_sequence_config, make_slam, make_slam_config
+from vibrissa.processes.verify import verify
+from vibrissa.slam.config import WHISKER
+
+CORNERS = """\
++---+---+
+|       |
++   +   +
+|       |
++---+---+
+"""
+
+
+def made(folder: Path, slam: str, swaps: str = "") -> Experiment:
+    (folder / "corners.maze").write_text(CORNERS)
+    path = folder / "experiment.toml"
+    path.write_text(
+        f"""\
+[run]
+duration = 9
+[maze]
+file = "corners.maze"
+[whisk]
+period = 0.4
+calibration_cycles = 1
+[arm]
+speed = 0.25
+lift = 0.05
+sequence = "CCCCCC"
+[slam]
+image = "contact_angle"
+{slam}
+{swaps}
+"""
+    )
+    return load_experiment(path)
+
+
+def swap(cycle: int, to: str) -> str:
+    return f'[[swap]]\nnode = "slam"\nat_cycle = {cycle}\nto = "{to}"\n'
+
+
+def test_ratslam_hands_over_to_the_sequence_slam_and_back_and_the_log_re_runs(
+    tmp_path: Path,
+) -> None:
+    out = tmp_path / "run"
+    swaps = swap(12, "sequence") + swap(16, "ratslam")
+    summary = simulate(made(tmp_path, "", swaps), out)
+    assert summary["cause"] == "completed"
+    assert [o.controller for o in said(out, "slam.owner")["slam"]] == ["slam.1", "slam"]
+    first, other = (said(out, "slam.pose")[name] for name in ("slam", "slam.1"))
+    assert {p.cycle for p in other} == {p.cycle for p in first}
+    # an experience of the sequence SLAM is a whisk, and places seen again are too few here
+    assert [p.experience for p in other] == list(range(len(other)))
+    for executor in ("fused", "lockstep"):
+        verdict = verify(out / "run.mcap", executor)
+        assert verdict.identical, verdict.first_difference
+        assert verdict.notes == ()
+
+
+def test_as_the_runs_first_slam_it_maps_every_whisk_and_the_log_re_runs(tmp_path: Path) -> None:
+    parameters = 'algorithm = "sequence"\nparameters = { lag = 10, gap = 6 }'
+    out = tmp_path / "run"
+    experiment = made(tmp_path, parameters, swap(14, "ratslam"))
+    assert simulate(experiment, out)["cause"] == "completed"
+    assert [o.controller for o in said(out, "slam.owner")["slam"]] == ["slam.1"]
+    seen = said(out, "slam.view")["slam"]
+    last = said(out, "slam.map")["slam"][-1]
+    assert len(last.poses) == len(seen) > 8
+    contacts = {tuple(view.contact_angle > 0) for view in seen}
+    assert max(view.template for view in seen) == len(contacts) - 1
+    verdict = verify(out / "run.mcap")
+    assert verdict.identical, verdict.first_difference
+
+
+@pytest.mark.parametrize(
+    ("slam", "words"),
+    [
+        ("parameters = { lag = 100 }", "slam.parameters.lag: no such RatSLAM parameter"),
+        (
+            'algorithm = "sequence"\nparameters = { vt_match_threshold = 0.1 }',
+            "slam.parameters.vt_match_threshold: no such parameter of the sequence SLAM",
+        ),
+        (
+            'algorithm = "sequence"\nparameters = { window = 1 }',
+            "slam.parameters.window: expected 2 to 100000, found 1",
+        ),
+        (
+            'algorithm = "sequence"\nparameters = { odometer_turn = 0.0 }',
+            "slam.parameters.odometer_turn: expected a finite number > 0, found 0.0",
+        ),
+        ('algorithm = "cartographer"', "'cartographer': expected one of ratslam, sequence"),
+    ],
+)
+def test_a_bad_parameter_is_refused_in_one_line(slam: str, words: str, tmp_path: Path) -> None:
+    with pytest.raises(RunError) as caught:
+        made(tmp_path, slam)
+    assert words in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "words"),
+    [
+        ({"lag": 1.5}, "slam.parameters.lag: expected int, found 1.5"),
+        ({"odometer_turn": True}, "slam.parameters.odometer_turn: expected a number, found True"),
+    ],
+)
+def test_a_bad_parameter_of_a_load_is_refused(
+    parameters: dict[str, object], words: str, tmp_path: Path
+) -> None:
+    experiment = made(tmp_path, "")
+    with pytest.raises(RunError, match=words):
+        make_slam("sequence", experiment, json.dumps(parameters))
+
+
+def test_parameters_of_the_section_are_those_of_its_algorithm(tmp_path: Path) -> None:
+    experiment = made(tmp_path, 'algorithm = "sequence"\nparameters = { lag = 7 }')
+    assert make_sequence_config(experiment, {"odometer_turn": 0.5}).lag == 7
+    assert make_sequence_config(experiment, {"odometer_turn": 0.5}).odometer.turn == 0.5
+    assert make_slam_config(experiment) == WHISKER
+    assert make_sequence_config(made(tmp_path, "")).lag == 100
