@@ -24,11 +24,15 @@ from vibrissa.rig.devices.errors import DeviceLimit, DeviceLost, DeviceStopped
 from vibrissa.rig.devices.limits import ARM, HEAD
 from vibrissa.rig.devices.virtual_arm import VirtualArm
 from vibrissa.rig.devices.watch import Phase, Watch
+from vibrissa.rig.plant import ARM_SECONDS
 
 START = (0.63, 0.09, 0.177, 0.0)
 TICK_NS = 500_000
 BRAKING_TICKS = math.ceil(ARM.speed / ARM.acceleration * 2000) + 16
 """From the highest speed to rest, and the period in which the stop comes."""
+STRIDE_MORE = 0.9 * ARM.acceleration * ARM_SECONDS**2
+FULL_STRIDE = 5 * STRIDE_MORE
+"""m per period: set-points gather speed within the limits."""
 
 
 class HandClock:
@@ -72,6 +76,7 @@ class Safely(RuleBasedStateMachine):
         self.watch = Watch({"news of the head": ARM.blind_ticks})
         self.arm = MutableArm(START)
         self.goal = list(START)
+        self.stride = 0.0
         self.halted_at: int | None = None
         self.lost = False
         self.tick = 0
@@ -110,9 +115,10 @@ class Safely(RuleBasedStateMachine):
             self.watch.look(self.now)
             self.look()
             if onward and self.watch.may_move:
-                self.goal[0] = min(self.goal[0] + 0.0003, 0.9)
                 self.tick += 16
                 self.arm.write(self.tick, (self.goal[0], *START[1:]))
+                self.stride = min(self.stride + STRIDE_MORE, FULL_STRIDE)
+                self.goal[0] = min(self.goal[0] + self.stride, 0.9)
 
     def look(self) -> None:
         """What the arm's process does once per turn."""
@@ -134,6 +140,7 @@ class Safely(RuleBasedStateMachine):
             return
         assert self.watch.start(self.now)
         self.goal = list(self.arm.report.pose)
+        self.stride = 0.0
         self.tick = 0
 
     @rule()
