@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.devices.benches import readings, serial_thread_bench, streaming
-from vibrissa.control.kinematics import paper_head
+from tests.devices.benches import readings
+from tests.devices.stepped import HandClock, stepped_head
+from vibrissa.control.kinematics import Float32s, paper_head
 from vibrissa.rig.devices.emulation import (
     DeviceClock,
     EmulatorProcess,
@@ -22,26 +23,30 @@ from vibrissa.rig.devices.emulation import (
 from vibrissa.rig.devices.errors import DeviceUnavailable
 
 
-def test_a_head_feels_the_walls_where_the_arm_carries_it(tmp_path: Path) -> None:
-    ear = PoseEar((0.0,) * 4, 0)
-    port, _ = ear.port, ear._socket and ear._socket.close()
-    bench = serial_thread_bench(tmp_path, "--hear", str(port))
-    mouth = PoseMouth(port)
+def test_a_head_feels_the_walls_where_the_arm_carries_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock = HandClock()
+    clock.put_into(monkeypatch)
+    head, emulator = stepped_head(clock, "walls", "--hear", "0")
+    mouth = PoseMouth(emulator.ear.port)
     protracted = (0.9 * paper_head().swing).astype(np.float32)
+
+    def felt(z: float) -> Float32s:
+        """Mean moments float32[18] of whiskers that rest, protracted, at this height."""
+        mouth.tell((0.63, 0.09, z, 0.0))
+        found = list(itertools.islice(readings(head, command=protracted), 1000))[600:]
+        assert np.ptp([r.theta.mean() for r in found]) < 0.02
+        return np.mean([r.y for r in found], axis=0, dtype=np.float32)
+
     try:
-        with streaming(bench) as head:
-            stream = readings(head, command=protracted)
-            free = 0.0  # N m
-            for _, reading in zip(range(600), stream, strict=False):
-                mouth.tell((0.63, 0.09, 0.4, 0.0))
-                free = max(free, float(np.abs(reading.y).max()))
-            assert free < 1e-3
-            for reading in stream:  # in the corridor, between its walls
-                mouth.tell((0.63, 0.09, 0.077, 0.0))
-                if np.abs(reading.y).max() > 2 * free:
-                    break
+        with head:
+            free, inside, free_again = felt(0.4), felt(0.077), felt(0.4)
     finally:
-        bench.close()
+        emulator.close()
+    noise = 1e-5 / np.sqrt(400)  # N m, of such a mean; the default of the plant
+    assert np.abs(free_again - free).max() < 6 * noise
+    assert np.abs(inside - free).max() > 30 * noise  # in the corridor, between its walls
 
 
 def test_poses_that_make_no_sense_are_not_taken() -> None:
