@@ -24,7 +24,7 @@ from vibrissa.processes.verify import verify
 
 SAID = {t: row.name for row in PROCESSES.values() for t in row.says if TOPICS[t].compared}
 """Compared topics and a node that says them."""
-RARE = ("node.answer", "head.shadow", "whisk.failure", "slam.owner", "slam.history")
+RARE = ("node.answer", "head.shadow", "whisk.failure", "slam.owner", "slam.history", "rig.event")
 COMPARED = [t for t in SAID if t not in RARE]
 """Those that the short experiment holds."""
 
