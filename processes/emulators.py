@@ -20,8 +20,9 @@ from vibrissa.rig.devices.emulation import EmulatorProcess
 from vibrissa.rig.devices.errors import DeviceError
 from vibrissa.rig.devices.rtde_wire import DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT
 
-PRIORITY: Final = 60
-"""SCHED_FIFO of an emulator, where it is granted: a device does not wait for our processes."""
+PRIORITY: Final = 45
+"""SCHED_FIFO of an emulator, where it is granted: below the loop from sample to command, which a
+real device does not interrupt, and above everybody else."""
 
 
 @dataclass

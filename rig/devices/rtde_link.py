@@ -27,6 +27,8 @@ STATE = struct.Struct("<d6d6d6dIi")
 POSE = struct.Struct("<6d")
 ENABLE, SERVO, HALT, RUNNING = b"E", b"S", b"H", b"R"
 POLL_S: Final = 0.0005
+EARLY_S: Final = 0.002
+"""How long before the next state is due polling begins."""
 PRIORITY: Final = 30
 """Of SCHED_FIFO, where the parent has it."""
 LOOKAHEAD: Final = 0.03
@@ -95,6 +97,7 @@ def listen(link: socket.socket, host: str, frequency: float) -> None:
     from rtde_receive import RTDEReceiveInterface
 
     receiver = RTDEReceiveInterface(host, frequency, VARIABLES)
+    pause = max(1.0 / frequency - EARLY_S, 0.0)
     last = receiver.getTimestamp()
     while receiver.isConnected():
         stamp = receiver.getTimestamp()
@@ -111,6 +114,7 @@ def listen(link: socket.socket, host: str, frequency: float) -> None:
         if receiver.getTimestamp() == stamp:  # else another packet has come between
             link.send(STATE.pack(stamp, *values))
             last = stamp
+            time.sleep(pause)
 
 
 def control(link: socket.socket, host: str, frequency: float, period: float, brake: float) -> None:
