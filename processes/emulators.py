@@ -20,9 +20,9 @@ from vibrissa.rig.devices.emulation import EmulatorProcess
 from vibrissa.rig.devices.errors import DeviceError
 from vibrissa.rig.devices.rtde_wire import DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT
 
-PRIORITY: Final = 45
-"""SCHED_FIFO of an emulator, where it is granted: below the loop from sample to command, which a
-real device does not interrupt, and above everybody else."""
+PRIORITY: Final = 35
+"""SCHED_FIFO of an emulator, where it is granted: below all that has to react, which a real device
+would not keep from running; late ticks are made up for."""
 
 
 @dataclass
