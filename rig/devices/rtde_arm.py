@@ -8,13 +8,14 @@ import time
 from typing import Final
 
 from vibrissa.rig.devices import rtde_wire, ur10
-from vibrissa.rig.devices.arm import ArmDevice, ArmReport, Controller, Safety
+from vibrissa.rig.devices.arm import TICK_NS, ArmDevice, ArmReport, Controller, Safety
 from vibrissa.rig.devices.errors import DeviceRefused, DeviceStopped, DeviceUnavailable
 from vibrissa.rig.devices.limits import ARM, ArmLimits, Pose
 from vibrissa.rig.devices.rtde_link import ENABLE, HALT, POSE, RUNNING, SERVO, STATE, Link
 
-ANSWER_S: Final = 0.05
-"""How long the control link may take for a set-point; the median is 0.1 ms."""
+ANSWER_SHARE: Final = 0.625
+"""How long the control link may take for a set-point, of the time without any; the median is 0.1 ms,
+the limit by default 50 ms."""
 HALT_S: Final = 0.3
 START_S: Final = 15.0
 
@@ -38,6 +39,7 @@ class RtdeArm(ArmDevice):
         self._standby: Link | None = None
         self._q: ur10.Joints | None = None
         self._tilt = 0.0
+        self._answer_s = ANSWER_SHARE * limits.stale_setpoint_ticks * TICK_NS * 1e-9
 
     def fileno(self) -> int:
         return self._listener.fileno() if self._listener is not None else -1
@@ -83,7 +85,7 @@ class RtdeArm(ArmDevice):
                 f"{self.name}: can't be enabled: expected the head's axis within "
                 f"{self.limits.tilt:.3g} rad of vertical, found it {self._tilt:.3g} off"
             )
-        if self._control is not None and self._control.done(RUNNING, ANSWER_S):
+        if self._control is not None and self._control.done(RUNNING, self._answer_s):
             return
         self._give_up_control()
         link = self._standby or self._make_control(self.info.period)
@@ -101,12 +103,12 @@ class RtdeArm(ArmDevice):
     def _send(self, setpoint: Pose) -> bool:
         assert self._mount is not None
         request = SERVO + POSE.pack(*self._mount.tcp(setpoint))
-        return self._control is not None and self._control.done(request, ANSWER_S)
+        return self._control is not None and self._control.done(request, self._answer_s)
 
     def _halt(self) -> None:
         if self._control is None or self._control.done(HALT, HALT_S):
             return
-        running = self._control.done(RUNNING, ANSWER_S)
+        running = self._control.done(RUNNING, self._answer_s)
         self._give_up_control()  # whose watchdog then stops the arm, if nothing has yet
         if running:
             raise DeviceRefused("the controller did not confirm the stop")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import collections
 import contextlib
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -162,11 +163,6 @@ def back_and_forth_as_csv(recorded: Recorded, folder: Path) -> None:
 
 LIMIT = 1000
 FAULTS = {
-    "a head that is unplugged": (
-        ("head", "unplug 30"),
-        {"sample": LIMIT},
-        ("head-device", f"no sample for {LIMIT} ticks"),
-    ),
     "a head of which every frame is damaged": (
         ("head", "errors 0.01"),
         {"sample": LIMIT},
@@ -180,8 +176,8 @@ FAULTS = {
     ),
     "a controller that reboots": (
         ("arm", "reboot 1"),
-        {},
-        ("arm-device", "takes no set-points"),
+        {"state": LIMIT},
+        ("arm-device", f"no state for {LIMIT} ticks|takes no set-points"),  # whichever is first
     ),
 }
 
@@ -196,7 +192,7 @@ def test_a_fault_of_a_device_retracts_the_whiskers_stops_the_arm_and_ends_the_ru
     assert retracts, "the process of the device decided"
     source, event = retracts[0]
     assert recorded.summary["cause"] == f"{source}: {event.cause}"
-    assert source == who and why in event.cause
+    assert source == who and re.search(why, event.cause)
     assert not recorded.summary["ok"]
     assert recorded.summary["steps"]["arm"] > 0
     assert recorded.records[-1].t < 15_000_000_000, "it ended early"
