@@ -21,8 +21,8 @@ from vibrissa.rig.devices.errors import DeviceError
 from vibrissa.rig.devices.rtde_wire import DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT
 
 NICE: Final = -15
-"""Of an emulator, where it is granted: before other work, after all that has to react. Under SCHED_FIFO
-it would use up what the kernel allows such processes of a core together."""
+"""Of an emulator, where it is granted: before other work, after all that has to react. Under
+SCHED_FIFO it would use up what the kernel allows such processes of a core together."""
 
 
 @dataclass

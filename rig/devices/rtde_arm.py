@@ -14,8 +14,8 @@ from vibrissa.rig.devices.limits import ARM, ArmLimits, Pose
 from vibrissa.rig.devices.rtde_link import ENABLE, HALT, POSE, RUNNING, SERVO, STATE, Link
 
 ANSWER_SHARE: Final = 0.625
-"""How long the control link may take for a set-point, of the time without any; the median is 0.1 ms,
-the limit by default 50 ms."""
+"""How long the control link may take for a set-point, as a share of the longest time without any:
+50 ms by default. The median is 0.1 ms."""
 HALT_S: Final = 0.3
 START_S: Final = 15.0
 
