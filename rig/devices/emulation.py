@@ -28,8 +28,8 @@ from vibrissa.rig.devices.errors import DeviceUnavailable
 READY_S: Final = 120.0
 ANSWER_S: Final = 30.0
 TICK_S: Final = 0.0005
-BACKLOG: Final = 2000
-"""Ticks an emulator makes up for when it was kept from running."""
+BACKLOG: Final = 40
+"""Ticks an emulator makes up for when it was kept from running; beyond them its clock is late."""
 _POSE = struct.Struct("<4d")
 Pose = tuple[float, float, float, float]
 
@@ -142,8 +142,8 @@ class Orders:
 class DeviceClock:
     """A 2 kHz clock of its own: `drift` (1e-6 is one ppm fast) and `jitter` of its ticks, s.
 
-    When its process was kept from running it makes up for late ticks at twice the pace: a head
-    sends no bursts.
+    When its process was kept from running it makes up for BACKLOG ticks, at twice the pace: a head
+    sends no bursts, and its clock is late for what was longer.
     """
 
     def __init__(self, drift: float = 0.0, jitter: float = 0.0, seed: int = 0) -> None:

@@ -11,6 +11,7 @@ from tests.devices.benches import readings
 from tests.devices.stepped import HandClock, stepped_head
 from vibrissa.control.kinematics import Float32s, paper_head
 from vibrissa.rig.devices.emulation import (
+    BACKLOG,
     DeviceClock,
     EmulatorProcess,
     Line,
@@ -62,31 +63,31 @@ def test_poses_that_make_no_sense_are_not_taken() -> None:
 def test_a_device_clock_drifts_as_it_was_told(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = HandClock()
     clock.put_into(monkeypatch)
-    fast, slow = DeviceClock(drift=0.5), DeviceClock(drift=-0.5, jitter=1e-4)
-    counts = ticks_of(fast, clock, 1.0), ticks_of(slow, clock, 1.0)
-    assert counts[0] == pytest.approx(3000, abs=2) and counts[1] == pytest.approx(1000, abs=2)
+    assert ticks_of(DeviceClock(drift=0.5), clock, 1.0) == pytest.approx(3000, abs=2)
+    assert ticks_of(DeviceClock(drift=-0.5, jitter=1e-4), clock, 1.0) == pytest.approx(1000, abs=2)
 
 
 def ticks_of(device: DeviceClock, clock: HandClock, seconds: float) -> int:
-    """How many ticks a device has that is looked at every 50 us."""
+    """How many ticks a device has that is looked at every 10 us."""
     count = 0
-    for _ in range(round(seconds / 50e-6)):
-        clock.ns += 50_000
+    for _ in range(round(seconds / 10e-6)):
+        clock.ns += 10_000
         count += device.due()
     return count
 
 
-def test_late_ticks_are_made_up_for_at_twice_the_pace(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_late_ticks_are_made_up_for_at_twice_the_pace_and_only_so_many(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     clock = HandClock()
     clock.put_into(monkeypatch)
     device = DeviceClock()
-    clock.ns += 50_000_000  # 100 ticks during which nobody ran it
-    assert ticks_of(device, clock, 0.045) == pytest.approx(180, abs=2)
-    assert ticks_of(device, clock, 0.1) == pytest.approx(210, abs=2)
+    clock.ns += (BACKLOG // 2) * 500_000
+    assert ticks_of(device, clock, 0.005) == pytest.approx(20, abs=2)
+    assert ticks_of(device, clock, 0.1) == pytest.approx(200 + BACKLOG // 2 - 10, abs=2)
     assert ticks_of(device, clock, 0.1) == pytest.approx(200, abs=2)
     clock.ns += 10**10  # more than it makes up for
-    device.due()
-    assert ticks_of(device, clock, 3.0) == pytest.approx(6000 + 2000, abs=3)
+    assert ticks_of(device, clock, 1.0) == pytest.approx(2000 + BACKLOG, abs=2)
 
 
 def test_bit_errors_have_the_rate_that_was_asked_for() -> None:
