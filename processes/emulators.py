@@ -20,9 +20,9 @@ from vibrissa.rig.devices.emulation import EmulatorProcess
 from vibrissa.rig.devices.errors import DeviceError
 from vibrissa.rig.devices.rtde_wire import DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT
 
-NICE: Final = -15
-"""Of an emulator, where it is granted: before other work, after all that has to react. Under
-SCHED_FIFO it would use up what the kernel allows such processes of a core together."""
+PRIORITY: Final = 35
+"""SCHED_FIFO of an emulator, where it is granted: below all that has to react, which a real device
+would not keep from running."""
 
 
 @dataclass
@@ -49,7 +49,7 @@ def devices(experiment: Experiment, folder: Path) -> Iterator[Devices]:
             found.emulators[what] = emulator
             if experiment.run.realtime:
                 with contextlib.suppress(OSError):
-                    os.setpriority(os.PRIO_PROCESS, emulator.pid, NICE)
+                    os.sched_setscheduler(emulator.pid, os.SCHED_FIFO, os.sched_param(PRIORITY))
             return emulator
 
         pose = ",".join(map(repr, make_path(experiment).pose(0)))
