@@ -210,6 +210,16 @@ class Calibrator:
         self._block_mean = np.zeros(blocks, dtype=np.float64)
         self._block_noise = np.zeros(blocks, dtype=np.float64)
         self._add(np.empty((0, WHISKERS)), np.empty((0, WHISKERS)))  # compiles before tick 0
+        self.mark()
+
+    def mark(self) -> None:
+        """Remember this moment for `back`; the beginning is remembered already."""
+        self._marked = self.seen, self._moments.copy(), self._derivative.copy()
+
+    def back(self) -> None:
+        """Forget the samples since the mark: they were no free whisking."""
+        self.seen = self._marked[0]
+        self._moments[:], self._derivative[:] = self._marked[1:]
 
     @property
     def complete(self) -> bool:

@@ -135,7 +135,7 @@ class DeviceClock:
     device: Annotated[str, Text(40)]
     tick: Tick
     device_ns: Annotated[int, Int(0, 2**62, "ns, the device's own clock at the end of the line")]
-    host_ns: Annotated[int, Int(-(2**62), 2**62, "ns since tick 0 was due, at that moment")]
+    host_ns: Annotated[int, Int(-(2**53), 2**53, "ns since tick 0 was due, at that moment")]
     drift: Annotated[float, Real(1.0, "how much faster the host's clock runs, 1e-6 is one ppm")]
 
 

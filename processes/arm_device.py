@@ -37,9 +37,15 @@ class ArmPump(Pump):
     """Owns the arm device of a run."""
 
     def __init__(self, layout: Layout) -> None:
-        super().__init__("arm-device", layout, Watch({"news of the head": ARM.blind_ticks}))
+        super().__init__("arm-device", layout)
+        rig = self.experiment.rig
+        self.watch = Watch({"news of the head": rig.news_ticks})
         self._path = make_path(self.experiment)
-        self.device = self._arm = make_arm(layout.devices["arm"], start=self._path.pose(0))
+        self.device = self._arm = make_arm(
+            layout.devices["arm"],
+            start=self._path.pose(0),
+            limits=ARM.within(stale=rig.state_ticks, setpoint=rig.setpoint_ticks),
+        )
         tell = layout.devices.get("tell")
         self._mouth = PoseMouth(int(tell)) if tell else None
         self._head_clock: DeviceClock | None = None
@@ -112,7 +118,10 @@ class ArmPump(Pump):
         except DeviceError as error:
             self.give_up(str(error))
             return
-        self.watch.start(self.now)
+        self.hear()  # set-points of that time lapse, and a stop wins
+        if not self.watch.start(self.now):
+            self.halt(self.watch.cause)
+            return
         who = f"{self._arm.info.name}, controller {self._arm.info.version}"
         self.report("enabled", f"{self._arm.name}: {who}: set-points go through from here on")
 

@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from vibrissa.messages.types import TICK_HZ
 from vibrissa.processes.calibration_file import VIRTUAL_HEAD, from_text
 from vibrissa.processes.results import RunError
+from vibrissa.rig.devices.limits import ARM, HEAD
 
 DEFAULT_MAZE = "board7x5.maze"
 RETRACT_S = 0.5
@@ -72,6 +73,21 @@ class Rig(Section):
     emulate: Annotated[
         bool, Field(description="play devices that are not virtual by emulators of this machine")
     ] = False
+    sample_ticks: Annotated[
+        int, Field(ge=80, le=4000, description="without a sample of the head after which it stops")
+    ] = HEAD.silence_ticks
+    command_ticks: Annotated[
+        int, Field(ge=80, le=4000, description="without a command that answers a sample, likewise")
+    ] = HEAD.overrun_ticks
+    news_ticks: Annotated[
+        int, Field(ge=200, le=4000, description="without news of the head at the arm, likewise")
+    ] = ARM.blind_ticks
+    state_ticks: Annotated[
+        int, Field(ge=40, le=4000, description="without a state of the arm, likewise")
+    ] = ARM.stale_ticks
+    setpoint_ticks: Annotated[
+        int, Field(ge=40, le=4000, description="without a set-point for the arm, likewise")
+    ] = ARM.stale_setpoint_ticks
 
     @property
     def virtual(self) -> bool:

@@ -162,7 +162,7 @@ class WhiskLoop:
         """
         run, period = self.run, self.run.period_ticks
         calibrator: Calibrator | None = Calibrator(run.calibration_cycles, period)
-        attempts = 1
+        spoilt = 0
         for first in range(0, run.ticks, period):
             ticks = min(period, run.ticks - first)
             theta, x, y, applied, command = self._buffer[:, :ticks]
@@ -177,10 +177,9 @@ class WhiskLoop:
             calibrating, calibration = calibrator is not None, None
             if calibrator is not None and ticks == period:
                 if _disturbed(before, applied, command):
-                    attempts += 1
-                    if attempts > MOST_ATTEMPTS:
-                        raise RunError(f"calibration: given up after {MOST_ATTEMPTS} attempts")
-                    calibrator = Calibrator(run.calibration_cycles, period)
+                    spoilt += 1
+                    if spoilt == MOST_ATTEMPTS:
+                        raise RunError(f"calibration: given up after {MOST_ATTEMPTS} cycles")
                 else:
                     calibrator.update(x, y)
                     if calibrator.complete:

@@ -19,7 +19,6 @@ from vibrissa.processes.rig import head_params
 from vibrissa.rig.devices.addresses import make_head
 from vibrissa.rig.devices.errors import DeviceRefused
 from vibrissa.rig.devices.head import Reading
-from vibrissa.rig.devices.limits import HEAD
 from vibrissa.rig.devices.watch import Watch
 from vibrissa.rig.maze import parse_maze
 from vibrissa.rig.scene import wall_boxes
@@ -28,15 +27,18 @@ WAIT_S: Final = 0.01
 VIRTUAL_WAIT_S: Final = 0.00025
 """A virtual head has nothing to wait on."""
 PROBES: Final = 4096
+MANY: Final = 200
+"""Samples taken in a row: a process too slow for its head must still hear everybody else."""
 
 
 class HeadPump(Pump):
     """Owns the head device of a run."""
 
     def __init__(self, layout: Layout) -> None:
-        watch = Watch({"sample": HEAD.silence_ticks, "command": HEAD.overrun_ticks})
-        super().__init__("head-device", layout, watch)
+        super().__init__("head-device", layout)
         experiment = self.experiment
+        rig = experiment.rig
+        self.watch = Watch({"sample": rig.sample_ticks, "command": rig.command_ticks})
         self._pose = make_path(experiment).pose(0)
         url = layout.devices["head"]
         if url == "virtual":
@@ -52,6 +54,7 @@ class HeadPump(Pump):
             self.device = self._head = make_head(url)
         self._base: int | None = None
         self._next = 0
+        self._behind = False
         self._due = (0, 0, 1.0)
         self._went_out = [0] * PROBES
         self._told = dataclasses.asdict(self._head.counters)
@@ -66,17 +69,24 @@ class HeadPump(Pump):
             )
 
     def drain(self) -> None:
-        while self._head.read(0) is not None:
-            pass
+        for _ in range(MANY):
+            if self._head.read(0) is None:
+                return
 
     def turn(self) -> None:
         wire = self._head.fileno()
         if wire >= 0:
-            self.port.wait(wire, WAIT_S)
-        reading = self._head.read(0 if wire >= 0 else VIRTUAL_WAIT_S)
-        while reading is not None:
+            self.port.wait(wire, 0.0 if self._behind else WAIT_S)
+        timeout = 0.0 if wire >= 0 else VIRTUAL_WAIT_S
+        self._behind = False
+        for _ in range(MANY):
+            reading = self._head.read(timeout)
+            if reading is None:
+                break
             self._sampled(reading)
-            reading = self._head.read(0)
+            timeout = 0.0
+        else:
+            self._behind = True
         self.hear()
         if not self.done:
             self.look(self.now)

@@ -47,11 +47,11 @@ class Pump(ABC):
     """One device of a live run. A subclass opens and reads it, and takes what the bus says."""
 
     device: HeadDevice | ArmDevice
+    watch: Watch
 
-    def __init__(self, name: str, layout: Layout, watch: Watch) -> None:
+    def __init__(self, name: str, layout: Layout) -> None:
         self.name = name
         self.layout = layout
-        self.watch = watch
         self.experiment = Experiment.model_validate_json(layout.experiment)
         row = DEVICES[name]
         wanted = row.priority if self.experiment.run.realtime else 0

@@ -181,6 +181,7 @@ DEVICES: Final[dict[str, Process]] = {
             says=("rig.arm", "rig.event", "rig.clock"),
             pacing="device",
             priority=40,
+            cores="any",
             silence=20.0,  # enabling an arm may take long; its own watchdog is what stops it
         ),
     )

@@ -40,6 +40,7 @@ from vibrissa.processes.results import RunError, one_line
 DISTURBANCE = 0.02
 """Largest distance of the drives' command from the controller's in free whisking, rad."""
 MOST_ATTEMPTS = 20
+"""Disturbed whisk cycles after which no calibration is to be expected."""
 TELLABLE: Final = np.full(WHISKERS, 6.3, np.float32)
 """The widest command that travels, rad; the arbiter judges it by the travel of the drives."""
 
@@ -56,9 +57,10 @@ class WhiskNode:
 
     For the first cycles the head is held free: what the whiskers feel then is the calibration. A
     touch during calibration is a fault that ends the run, because the thresholds would be blind.
-    Cycles in which the drives did not get what was commanded are no free whisking; calibration
-    starts over after them. A controller that comes later is handed the calibration. With the file
-    of an earlier calibration one cycle is enough: it shows that nothing touches, the file counts.
+    Cycles in which the drives did not get what was commanded are no free whisking and don't count;
+    after MOST_ATTEMPTS of them it is given up. A controller that comes later is handed the
+    calibration. With the file of an earlier calibration one cycle is enough: it shows that nothing
+    touches, the file counts.
 
     A controller that raises an error, or answers with anything but 18 finite angles, has failed: it
     is never asked again, and the sampler hears of it in the same tick.
@@ -75,12 +77,13 @@ class WhiskNode:
             self._given = from_text(text, f"whisk.calibration {file}")[0]
             self._calibration_cycles = 1
         self._disturbed = False
-        self._attempts = 1
+        self._spoilt = 0
         self._controller: Controller | None = None
         self._calibrator: Calibrator | None = None
         if name == "whisk":
             self._controller = make_controller(experiment.whisk.controller, experiment)
-            self._calibrator = self._fresh_calibrator()
+            inertial = inertial_moment(paper_head(), self._period)
+            self._calibrator = Calibrator(self._calibration_cycles, self._period, inertial=inertial)
         self._calibration: Calibration | None = None
         self._owner = False
         self._change: Ownership | None = None
@@ -139,8 +142,8 @@ class WhiskNode:
             if self._owner:
                 self._cycles += 1
                 yield "whisk.cycle", cycle
-            if self._disturbed:
-                yield from self._start_over(tick)
+            if self._calibrator is not None:
+                yield from self._count_cycle(self._calibrator, tick)
 
     def _own(self, owner: bool) -> None:
         """Become or cease to be the owner; whoever gains the drives starts from what they hold."""
@@ -174,10 +177,6 @@ class WhiskNode:
         setter(order.name, json.loads(order.value))
         return f"{order.name} = {order.value}"
 
-    def _fresh_calibrator(self) -> Calibrator:
-        inertial = inertial_moment(paper_head(), self._period)
-        return Calibrator(self._calibration_cycles, self._period, inertial=inertial)
-
     def _calibrate(self, calibrator: Calibrator, sample: HeadSample) -> list[Output]:
         if self._disturbed:
             return []
@@ -197,20 +196,23 @@ class WhiskNode:
             _call(self._controller.calibrate, calibration)
         return [("whisk.calibration", as_message(calibration))]
 
-    def _start_over(self, tick: int) -> list[Output]:
+    def _count_cycle(self, calibrator: Calibrator, tick: int) -> list[Output]:
+        if not self._disturbed:
+            calibrator.mark()
+            return []
+        calibrator.back()
         self._disturbed = False
-        self._attempts += 1
-        if self._attempts > MOST_ATTEMPTS:
-            self._calibrator = None
-            return [
-                _fault(
-                    tick,
-                    f"calibration: given up after {MOST_ATTEMPTS} attempts, each time the drives "
-                    f"were more than {DISTURBANCE} rad from what was commanded",
-                )
-            ]
-        self._calibrator = self._fresh_calibrator()
-        return []
+        self._spoilt += 1
+        if self._spoilt < MOST_ATTEMPTS:
+            return []
+        self._calibrator = None
+        return [
+            _fault(
+                tick,
+                f"calibration: given up after {MOST_ATTEMPTS} cycles in which the drives were "
+                f"more than {DISTURBANCE} rad from what was commanded",
+            )
+        ]
 
     def _cycle(self, tick: int, calibrating: bool) -> WhiskCycle:
         cycle = WhiskCycle(

@@ -118,7 +118,9 @@ def targets(rows: list[dict[str, Any]], parsers: list[dict[str, Any]]) -> list[T
     for row in rows[1:]:
         name = row["rig"]
         lost = row["samples_lost"]
+        completed = float(row["cause"] == "completed")
         found += [
+            Target(f"{name}: runs that complete", completed, "runs", "==", 1),
             Target(f"{name}: samples lost", lost, "samples", "==", 0),
             Target(f"{name}: messages lost", row["messages_lost"], "messages", "==", 0),
             Target(f"{name}: logs that verify", float(row["verified"] == "yes"), "runs", "==", 1),

@@ -16,6 +16,7 @@ from vibrissa.control.kinematics import Float64s
 from vibrissa.rig.devices.arm import ArmDevice
 from vibrissa.rig.devices.errors import DeviceAddressError
 from vibrissa.rig.devices.head import HeadDevice
+from vibrissa.rig.devices.limits import ARM, ArmLimits
 from vibrissa.rig.devices.virtual_arm import VirtualArm
 from vibrissa.rig.devices.virtual_head import NOWHERE, VirtualHead
 from vibrissa.rig.plant import HeadPlantParams, Pose
@@ -97,7 +98,7 @@ def make_head(
     return VirtualHead(boxes, pose, seed=seed, params=params)
 
 
-def make_arm(url: str, *, start: Pose = START) -> ArmDevice:
+def make_arm(url: str, *, start: Pose = START, limits: ArmLimits = ARM) -> ArmDevice:
     """The arm of a URL, not opened yet; start: where a virtual one holds the head.
 
     Raises DeviceAddressError.
@@ -105,10 +106,10 @@ def make_arm(url: str, *, start: Pose = START) -> ArmDevice:
     address = parse(url, "rig.arm", ("virtual", "rtde"))
     _numbers(address, "rig.arm", {})
     if address.scheme == "virtual":
-        return VirtualArm(start)
+        return VirtualArm(start, limits=limits)
     from vibrissa.rig.devices.rtde_arm import RtdeArm
 
-    return RtdeArm(address.place)
+    return RtdeArm(address.place, limits=limits)
 
 
 def open_head(url: str) -> HeadDevice:

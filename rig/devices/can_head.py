@@ -20,6 +20,9 @@ from vibrissa.rig.devices.protocol import FromHead, FromHost
 
 MANY = 512
 """Frames taken at once."""
+PARTNER_S = 0.0003
+"""How long to wait for a sample's other frame, which takes 0.15 ms on the wire: less than another
+wake-up costs."""
 
 
 class CanHead(HeadDevice):
@@ -74,6 +77,8 @@ class CanHead(HeadDevice):
                 item = assembler.take((message.arbitration_id, bytes(message.data)))
                 if item is not None:
                     items.append(item)
+                elif assembler.halfway:
+                    timeout = PARTNER_S
         except can.CanError as error:
             raise OSError(str(error)) from None
         counters.frames, counters.resyncs = assembler.frames, assembler.incomplete

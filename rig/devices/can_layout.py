@@ -119,6 +119,11 @@ class Assembler:
         self._a: tuple[int, int, int, bytes] | None = None
         self._hello: dict[int, bytes] = {}
 
+    @property
+    def halfway(self) -> bool:
+        """Whether the other frame of a sample is to come."""
+        return self._a is not None
+
     def restart(self) -> None:
         """Forget what was begun."""
         self._a = None

@@ -28,8 +28,8 @@ from vibrissa.rig.devices.errors import DeviceUnavailable
 READY_S: Final = 120.0
 ANSWER_S: Final = 30.0
 TICK_S: Final = 0.0005
-BACKLOG: Final = 2000
-"""Ticks an emulator makes up for when it was kept from running."""
+BACKLOG: Final = 40
+"""Ticks an emulator makes up for when it was kept from running; beyond them its clock is late."""
 _POSE = struct.Struct("<4d")
 Pose = tuple[float, float, float, float]
 
@@ -140,7 +140,11 @@ class Orders:
 
 
 class DeviceClock:
-    """A 2 kHz clock of its own: `drift` (1e-6 is one ppm fast) and `jitter` of its ticks, s."""
+    """A 2 kHz clock of its own: `drift` (1e-6 is one ppm fast) and `jitter` of its ticks, s.
+
+    When its process was kept from running it makes up for BACKLOG ticks, at twice the pace: a head
+    sends no bursts, and its clock is late for what was longer.
+    """
 
     def __init__(self, drift: float = 0.0, jitter: float = 0.0, seed: int = 0) -> None:
         self._period = TICK_S / (1.0 + drift)
@@ -153,16 +157,14 @@ class DeviceClock:
         return max(self._next - time.monotonic(), 0.0)
 
     def due(self) -> int:
-        """How many ticks have become due since the last call."""
+        """Whether a tick has become due since the last one: 0 or 1 of them."""
         now = time.monotonic()
-        count = 0
-        while self._next <= now and count < BACKLOG:
-            count += 1
-            self._ideal += self._period
-            self._next = self._ideal + self._random.random() * self._jitter
-        if count == BACKLOG:
-            self._next = self._ideal = now
-        return count
+        if self._next > now:
+            return 0
+        self._ideal = max(self._ideal, now - BACKLOG * self._period) + self._period
+        jitter = self._random.random() * self._jitter
+        self._next = max(self._ideal + jitter, now + 0.5 * self._period)
+        return 1
 
 
 class Line:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -30,9 +30,10 @@ class HeadLimits:
 
     low, high      rad, float32[18], range of a command: the swing and the margin of the stops
     watchdog_ticks without a command after which the firmware itself retracts the whiskers
-    silence_ticks  without a sample after which a run stops: whiskers retract, the arm brakes; more
-                   than a head that was reset needs to be asked and to answer
-    overrun_ticks  of samples without a command to answer them after which a run stops
+    silence_ticks  without a sample after which a run stops: whiskers retract, the arm brakes; half
+                   as long again as a drop-out of 100 ms, and longer than a head that was reset
+                   needs to be asked (after 100 ms) and to answer
+    overrun_ticks  without a command that answers a sample after which a run stops
     patience       s without a sample after which the head counts as lost
     """
 
@@ -41,8 +42,8 @@ class HeadLimits:
         default_factory=lambda: (paper_head().swing + STOP_MARGIN).astype(np.float32)
     )
     watchdog_ticks: int = 40
-    silence_ticks: int = 400
-    overrun_ticks: int = 400
+    silence_ticks: int = 300
+    overrun_ticks: int = 300
     patience: float = 5.0
 
     def check(self, tick: int, command: Float32s) -> None:
@@ -72,10 +73,12 @@ class ArmLimits:
     tilt              rad, the head's axis may be off vertical by this
     deceleration      m/s^2 of a stop
     start_jump        m and rad, the first set-point may be this far from where the arm is
-    stale_ticks       without a new state after which the arm is stopped
-    stale_setpoint_ticks  without a new set-point after which the arm is decelerated
-    blind_ticks       without news of the head after which the arm is stopped
-    watchdog          Hz, slower than this and the controller itself stops the program
+    stale_ticks       without a new state after which the arm is stopped; set-points answer states,
+                      so that it holds already
+    stale_setpoint_ticks  without a new set-point after which the arm, which holds, is stopped
+    blind_ticks       without news of the head, said every 100 ticks, after which the arm is stopped
+    watchdog          Hz, slower than this and the controller itself stops the program; a little
+                      slower than stale_setpoint_ticks, so that the driver is first
     patience          s without a state after which the arm counts as lost
     """
 
@@ -90,11 +93,16 @@ class ArmLimits:
     tilt: float = 2.0 * DEGREE
     deceleration: float = 2.0
     start_jump: float = 0.02
-    stale_ticks: int = 400
-    stale_setpoint_ticks: int = 320
-    blind_ticks: int = 600
-    watchdog: float = 5.0
+    stale_ticks: int = 200
+    stale_setpoint_ticks: int = 160
+    blind_ticks: int = 400
+    watchdog: float = 10.0
     patience: float = 5.0
+
+    def within(self, *, stale: int, setpoint: int) -> ArmLimits:
+        """These limits with other time-outs, ticks; the controller's watchdog follows."""
+        watchdog = self.watchdog * self.stale_setpoint_ticks / setpoint
+        return replace(self, stale_ticks=stale, stale_setpoint_ticks=setpoint, watchdog=watchdog)
 
     def check_pose(self, where: str, pose: Pose) -> None:
         """Raises DeviceLimit when a head pose is not finite or outside the workspace."""

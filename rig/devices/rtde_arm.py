@@ -8,13 +8,14 @@ import time
 from typing import Final
 
 from vibrissa.rig.devices import rtde_wire, ur10
-from vibrissa.rig.devices.arm import ArmDevice, ArmReport, Controller, Safety
+from vibrissa.rig.devices.arm import TICK_NS, ArmDevice, ArmReport, Controller, Safety
 from vibrissa.rig.devices.errors import DeviceRefused, DeviceStopped, DeviceUnavailable
 from vibrissa.rig.devices.limits import ARM, ArmLimits, Pose
-from vibrissa.rig.devices.rtde_link import HALT, POSE, RUNNING, SERVO, STATE, Link
+from vibrissa.rig.devices.rtde_link import ENABLE, HALT, POSE, RUNNING, SERVO, STATE, Link
 
-ANSWER_S: Final = 0.05
-"""How long the control link may take for a set-point; the median is 0.1 ms."""
+ANSWER_SHARE: Final = 0.625
+"""How long the control link may take for a set-point, as a share of the longest time without any:
+50 ms by default. The median is 0.1 ms."""
 HALT_S: Final = 0.3
 START_S: Final = 15.0
 
@@ -22,8 +23,10 @@ START_S: Final = 15.0
 class RtdeArm(ArmDevice):
     """A UR10 whose controller answers at `host`.
 
-    Opening only listens. `enable` uploads the control script, asks the controller to stop by itself
-    when set-points stay away (`limits.watchdog`), and lets set-points through, each as a servoL.
+    Opening only listens; a second link stands by, so that `enable` need not wait for a process to
+    start, and says nothing to the controller yet. `enable` uploads the control script, asks the
+    controller to stop by itself when set-points stay away (`limits.watchdog`), and lets set-points
+    through, each as a servoL.
     """
 
     def __init__(
@@ -33,8 +36,10 @@ class RtdeArm(ArmDevice):
         self._host = host
         self._listener: Link | None = None
         self._control: Link | None = None
+        self._standby: Link | None = None
         self._q: ur10.Joints | None = None
         self._tilt = 0.0
+        self._answer_s = ANSWER_SHARE * limits.stale_setpoint_ticks * TICK_NS * 1e-9
 
     def fileno(self) -> int:
         return self._listener.fileno() if self._listener is not None else -1
@@ -44,13 +49,18 @@ class RtdeArm(ArmDevice):
         found = rtde_wire.probe(self._host)  # ur-rtde would wait for ever for a mute controller
         period = 0.008 if found.version[0] < 5 else 0.002
         self._listener = Link("listen", self._host, str(1.0 / period))
+        self._standby = self._make_control(period)
         return Controller("UR10", ".".join(map(str, found.version)), period)
 
     def _disconnect(self) -> None:
-        for link in (self._control, self._listener):
+        for link in (self._control, self._standby, self._listener):
             if link is not None:
                 link.end()
-        self._control = self._listener = None
+        self._control = self._standby = self._listener = None
+
+    def _make_control(self, period: float) -> Link:
+        numbers = (self.limits.watchdog, period, self.limits.deceleration)
+        return Link("control", self._host, *map(str, numbers))
 
     def _next(self, timeout: float) -> ArmReport | None:
         assert self._listener is not None and self._mount is not None
@@ -75,13 +85,13 @@ class RtdeArm(ArmDevice):
                 f"{self.name}: can't be enabled: expected the head's axis within "
                 f"{self.limits.tilt:.3g} rad of vertical, found it {self._tilt:.3g} off"
             )
-        if self._control is not None and self._control.ask(RUNNING, ANSWER_S):
+        if self._control is not None and self._control.done(RUNNING, self._answer_s):
             return
         self._give_up_control()
-        numbers = (self.limits.watchdog, self.info.period, self.limits.deceleration)
-        link = Link("control", self._host, *map(str, numbers))
+        link = self._standby or self._make_control(self.info.period)
+        self._standby = None
         try:
-            answer = link.receive(START_S)
+            answer = link.ask(ENABLE, START_S)
         except OSError:
             answer = b"ur-rtde has crashed"
         if answer != b"1":
@@ -93,12 +103,12 @@ class RtdeArm(ArmDevice):
     def _send(self, setpoint: Pose) -> bool:
         assert self._mount is not None
         request = SERVO + POSE.pack(*self._mount.tcp(setpoint))
-        return self._control is not None and self._control.ask(request, ANSWER_S)
+        return self._control is not None and self._control.done(request, self._answer_s)
 
     def _halt(self) -> None:
-        if self._control is None or self._control.ask(HALT, HALT_S):
+        if self._control is None or self._control.done(HALT, HALT_S):
             return
-        running = self._control.ask(RUNNING, ANSWER_S)
+        running = self._control.done(RUNNING, self._answer_s)
         self._give_up_control()  # whose watchdog then stops the arm, if nothing has yet
         if running:
             raise DeviceRefused("the controller did not confirm the stop")

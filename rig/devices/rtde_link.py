@@ -5,8 +5,8 @@ reconnect from a thread of their own and crash when they are interrupted in that
 given up at any moment by ending the process; the controller's watchdog then stops the arm.
 
 The parent talks over a socket that keeps messages apart. `listen` sends a STATE per packet of the
-controller. `control` answers every request with one byte: b"1" done, b"0" not; its first message,
-unasked, is b"1" or the reason why it could not start.
+controller. `control` does nothing before it is asked to ENABLE, which it answers with b"1" or the
+reason why it can't, and then every request with one byte: b"1" done, b"0" not.
 """
 
 from __future__ import annotations
@@ -25,8 +25,10 @@ from typing import Any, Final
 STATE = struct.Struct("<d6d6d6dIi")
 """stamp; joints; TCP pose; TCP speed; safety bits; robot mode."""
 POSE = struct.Struct("<6d")
-SERVO, HALT, RUNNING = b"S", b"H", b"R"
+ENABLE, SERVO, HALT, RUNNING = b"E", b"S", b"H", b"R"
 POLL_S: Final = 0.0005
+EARLY_S: Final = 0.002
+"""How long before the next state is due polling begins."""
 PRIORITY: Final = 30
 """Of SCHED_FIFO, where the parent has it."""
 LOOKAHEAD: Final = 0.03
@@ -67,11 +69,15 @@ class Link:
             raise OSError("the link has ended")
         return data
 
-    def ask(self, request: bytes, timeout: float) -> bool:
+    def ask(self, request: bytes, timeout: float) -> bytes | None:
+        """What is answered, None when nothing is in time. Raises OSError as `receive` does."""
+        self._socket.send(request)
+        return self.receive(timeout)
+
+    def done(self, request: bytes, timeout: float) -> bool:
         """Whether a request was done; False too when there is no answer in time."""
         try:
-            self._socket.send(request)
-            return self.receive(timeout) == b"1"
+            return self.ask(request, timeout) == b"1"
         except OSError:
             return False
 
@@ -91,6 +97,7 @@ def listen(link: socket.socket, host: str, frequency: float) -> None:
     from rtde_receive import RTDEReceiveInterface
 
     receiver = RTDEReceiveInterface(host, frequency, VARIABLES)
+    pause = max(1.0 / frequency - EARLY_S, 0.0)
     last = receiver.getTimestamp()
     while receiver.isConnected():
         stamp = receiver.getTimestamp()
@@ -107,12 +114,15 @@ def listen(link: socket.socket, host: str, frequency: float) -> None:
         if receiver.getTimestamp() == stamp:  # else another packet has come between
             link.send(STATE.pack(stamp, *values))
             last = stamp
+            time.sleep(pause)
 
 
 def control(link: socket.socket, host: str, frequency: float, period: float, brake: float) -> None:
     """Carry out the parent's requests. frequency: Hz of the watchdog; brake: m/s^2."""
     from rtde_control import RTDEControlInterface
 
+    if link.recv(256) != ENABLE:
+        return
     try:
         controller: Any = RTDEControlInterface(host, 1.0 / period)
         if not controller.setWatchdog(frequency):

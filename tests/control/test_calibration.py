@@ -96,6 +96,21 @@ def test_samples_and_blocks_give_the_same_bits(cuts: list[int]) -> None:
             assert getattr(found, name).tobytes() == getattr(expected, name).tobytes()
 
 
+def test_samples_since_the_mark_can_be_forgotten() -> None:
+    x, y = (signal.astype(np.float32) for signal in free_whisking())
+    expected = calibrate(x, y)
+    calibrator = Calibrator(CYCLES, PERIOD)
+    at = 3 * PERIOD // 2
+    for a, b in ((0, at), (at, SAMPLES)):
+        calibrator.mark()
+        calibrator.update(x[a:b] + 1.0, y[a:b] - 1.0)
+        calibrator.back()
+        assert calibrator.seen == a
+        calibrator.update(x[a:b], y[a:b])
+    for name in ("mean_y", "sigma_y", "threshold_y", "mean_dy", "threshold_dy"):
+        assert getattr(calibrator.result(), name).tobytes() == getattr(expected, name).tobytes()
+
+
 @given(
     seed=st.integers(0, 10**6),
     sigma=st.floats(1e-7, 1e-4),

@@ -123,7 +123,7 @@ def in_thread(emulator: HeadEmulator) -> tuple[Callable[[str], str], Callable[[]
         while not done.is_set():
             with lock:
                 emulator.turn()
-            time.sleep(0.001)
+            time.sleep(min(emulator.clock.wait(), 0.001))
 
     thread = threading.Thread(target=live, daemon=True)
     thread.start()

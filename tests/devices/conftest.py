@@ -9,7 +9,7 @@ import pytest
 from tests.devices.benches import MAKERS, HeadBench
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def head_benches() -> Iterator[Callable[[str], HeadBench]]:
     made: dict[str, HeadBench] = {}
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import time
-from pathlib import Path
+import itertools
 
 import numpy as np
 import pytest
 
-from tests.devices.benches import readings, serial_thread_bench, streaming
-from vibrissa.control.kinematics import paper_head
+from tests.devices.benches import readings
+from tests.devices.stepped import HandClock, stepped_head
+from vibrissa.control.kinematics import Float32s, paper_head
 from vibrissa.rig.devices.emulation import (
+    BACKLOG,
     DeviceClock,
     EmulatorProcess,
     Line,
@@ -22,26 +23,30 @@ from vibrissa.rig.devices.emulation import (
 from vibrissa.rig.devices.errors import DeviceUnavailable
 
 
-def test_a_head_feels_the_walls_where_the_arm_carries_it(tmp_path: Path) -> None:
-    ear = PoseEar((0.0,) * 4, 0)
-    port, _ = ear.port, ear._socket and ear._socket.close()
-    bench = serial_thread_bench(tmp_path, "--hear", str(port))
-    mouth = PoseMouth(port)
+def test_a_head_feels_the_walls_where_the_arm_carries_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock = HandClock()
+    clock.put_into(monkeypatch)
+    head, emulator = stepped_head(clock, "walls", "--hear", "0")
+    mouth = PoseMouth(emulator.ear.port)
     protracted = (0.9 * paper_head().swing).astype(np.float32)
+
+    def felt(z: float) -> Float32s:
+        """Mean moments float32[18] of whiskers that rest, protracted, at this height."""
+        mouth.tell((0.63, 0.09, z, 0.0))
+        found = list(itertools.islice(readings(head, command=protracted), 1000))[600:]
+        assert np.ptp([r.theta.mean() for r in found]) < 0.02
+        return np.mean([r.y for r in found], axis=0, dtype=np.float32)
+
     try:
-        with streaming(bench) as head:
-            stream = readings(head, command=protracted)
-            free = 0.0  # N m
-            for _, reading in zip(range(600), stream, strict=False):
-                mouth.tell((0.63, 0.09, 0.4, 0.0))
-                free = max(free, float(np.abs(reading.y).max()))
-            assert free < 1e-3
-            for reading in stream:  # in the corridor, between its walls
-                mouth.tell((0.63, 0.09, 0.077, 0.0))
-                if np.abs(reading.y).max() > 2 * free:
-                    break
+        with head:
+            free, inside, free_again = felt(0.4), felt(0.077), felt(0.4)
     finally:
-        bench.close()
+        emulator.close()
+    noise = 1e-5 / np.sqrt(400)  # N m, of such a mean; the default of the plant
+    assert np.abs(free_again - free).max() < 6 * noise
+    assert np.abs(inside - free).max() > 30 * noise  # in the corridor, between its walls
 
 
 def test_poses_that_make_no_sense_are_not_taken() -> None:
@@ -55,11 +60,34 @@ def test_poses_that_make_no_sense_are_not_taken() -> None:
     assert read_pose("1,2,3,4") == (1.0, 2.0, 3.0, 4.0)
 
 
-def test_a_device_clock_drifts_as_it_was_told() -> None:
-    fast, slow = DeviceClock(drift=0.5), DeviceClock(drift=-0.5)
-    time.sleep(0.05)
-    ticks = fast.due(), slow.due()
-    assert 2.5 < ticks[0] / ticks[1] < 3.5
+def test_a_device_clock_drifts_as_it_was_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = HandClock()
+    clock.put_into(monkeypatch)
+    assert ticks_of(DeviceClock(drift=0.5), clock, 1.0) == pytest.approx(3000, abs=2)
+    assert ticks_of(DeviceClock(drift=-0.5, jitter=1e-4), clock, 1.0) == pytest.approx(1000, abs=2)
+
+
+def ticks_of(device: DeviceClock, clock: HandClock, seconds: float) -> int:
+    """How many ticks a device has that is looked at every 10 us."""
+    count = 0
+    for _ in range(round(seconds / 10e-6)):
+        clock.ns += 10_000
+        count += device.due()
+    return count
+
+
+def test_late_ticks_are_made_up_for_at_twice_the_pace_and_only_so_many(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock = HandClock()
+    clock.put_into(monkeypatch)
+    device = DeviceClock()
+    clock.ns += (BACKLOG // 2) * 500_000
+    assert ticks_of(device, clock, 0.005) == pytest.approx(20, abs=2)
+    assert ticks_of(device, clock, 0.1) == pytest.approx(200 + BACKLOG // 2 - 10, abs=2)
+    assert ticks_of(device, clock, 0.1) == pytest.approx(200, abs=2)
+    clock.ns += 10**10  # more than it makes up for
+    assert ticks_of(device, clock, 1.0) == pytest.approx(2000 + BACKLOG, abs=2)
 
 
 def test_bit_errors_have_the_rate_that_was_asked_for() -> None:

@@ -4,7 +4,6 @@ by a model), on a clock that the test turns."""
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -17,47 +16,19 @@ from hypothesis.stateful import (
     rule,
 )
 
-from vibrissa.rig.devices import arm as arm_module
-from vibrissa.rig.devices import virtual_arm as virtual_arm_module
+from tests.devices.stepped import TICK_NS, HandClock, MutableArm
 from vibrissa.rig.devices.arm import Safety, State
 from vibrissa.rig.devices.errors import DeviceLimit, DeviceLost, DeviceStopped
 from vibrissa.rig.devices.limits import ARM, HEAD
-from vibrissa.rig.devices.virtual_arm import VirtualArm
 from vibrissa.rig.devices.watch import Phase, Watch
+from vibrissa.rig.plant import ARM_SECONDS
 
 START = (0.63, 0.09, 0.177, 0.0)
-TICK_NS = 500_000
 BRAKING_TICKS = math.ceil(ARM.speed / ARM.acceleration * 2000) + 16
 """From the highest speed to rest, and the period in which the stop comes."""
-
-
-class HandClock:
-    """What the modules under test take for `time`."""
-
-    def __init__(self) -> None:
-        self.ns = 10**9
-
-    def monotonic_ns(self) -> int:
-        return self.ns
-
-    def monotonic(self) -> float:
-        return self.ns * 1e-9
-
-    def sleep(self, seconds: float) -> None:
-        self.ns += math.ceil(max(seconds, 0.0) * 1e9)
-
-
-class MutableArm(VirtualArm):
-    """A virtual arm that can fall silent."""
-
-    mute = False
-
-    def _next(self, timeout: float) -> Any:
-        if self.mute:
-            virtual_arm_module.time.sleep(timeout)
-            self._due = virtual_arm_module.time.monotonic()
-            return None
-        return super()._next(timeout)
+STRIDE_MORE = 0.9 * ARM.acceleration * ARM_SECONDS**2
+FULL_STRIDE = 5 * STRIDE_MORE
+"""m per period: set-points gather speed within the limits."""
 
 
 class Safely(RuleBasedStateMachine):
@@ -67,11 +38,11 @@ class Safely(RuleBasedStateMachine):
         super().__init__()
         self.patch = pytest.MonkeyPatch()
         self.clock = HandClock()
-        self.patch.setattr(arm_module, "time", self.clock)
-        self.patch.setattr(virtual_arm_module, "time", self.clock)
+        self.clock.put_into(self.patch)
         self.watch = Watch({"news of the head": ARM.blind_ticks})
         self.arm = MutableArm(START)
         self.goal = list(START)
+        self.stride = 0.0
         self.halted_at: int | None = None
         self.lost = False
         self.tick = 0
@@ -110,9 +81,10 @@ class Safely(RuleBasedStateMachine):
             self.watch.look(self.now)
             self.look()
             if onward and self.watch.may_move:
-                self.goal[0] = min(self.goal[0] + 0.0003, 0.9)
                 self.tick += 16
                 self.arm.write(self.tick, (self.goal[0], *START[1:]))
+                self.stride = min(self.stride + STRIDE_MORE, FULL_STRIDE)
+                self.goal[0] = min(self.goal[0] + self.stride, 0.9)
 
     def look(self) -> None:
         """What the arm's process does once per turn."""
@@ -134,6 +106,7 @@ class Safely(RuleBasedStateMachine):
             return
         assert self.watch.start(self.now)
         self.goal = list(self.arm.report.pose)
+        self.stride = 0.0
         self.tick = 0
 
     @rule()

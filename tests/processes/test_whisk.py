@@ -104,6 +104,19 @@ def test_a_cycle_in_which_the_drives_did_something_else_does_not_count_for_calib
     assert of(head.outputs, "node.event") == []
 
 
+def test_cycles_before_a_disturbed_one_count(short: Experiment) -> None:
+    two = short.model_copy(
+        update={"whisk": short.whisk.model_copy(update={"calibration_cycles": 2})}
+    )
+    head = Head(two)
+    head.run(short.period_ticks + short.period_ticks // 2)
+    head.run(50, obey=False)
+    head.run(short.period_ticks - short.period_ticks // 2 - 50)
+    assert of(head.outputs, "whisk.calibration") == []
+    (calibration,) = of(head.run(short.period_ticks), "whisk.calibration")
+    assert calibration.samples == 2 * short.period_ticks
+
+
 def test_calibration_that_is_always_disturbed_is_given_up(short: Experiment) -> None:
     head = Head(short)
     head.run(25 * short.period_ticks, obey=False)
