@@ -165,7 +165,7 @@ class Slam(Section):
     ] = "max_angle_gated"
     preset: Annotated[str, Field(description="named RatSLAM parameter set")] = "whisker"
     parameters: Annotated[
-        dict[str, float | int | bool], Field(description="of the algorithm: see docs/slam.md")
+        dict[str, float | int | bool], Field(description="over the preset; sequence: docs/slam.md")
     ] = {}
     odometry_noise: Annotated[str, Field(description="named odometry noise model")] = "none"
 

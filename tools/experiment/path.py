@@ -127,4 +127,6 @@ def _displace(
         yaw = poses[j, 3]
         poses[j, 0] -= offset * sin(yaw)
         poses[j, 1] += offset * cos(yaw)
-        poses[j, 3] += smooth * (yaws[k, second] + (yaws[k, second + 1] - yaws[k, second]) * part)
+        eased = part * part * (3.0 - 2.0 * part)  # the wrist's rate must not jump
+        turned = yaws[k, second] + (yaws[k, second + 1] - yaws[k, second]) * eased
+        poses[j, 3] += smooth * turned

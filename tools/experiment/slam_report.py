@@ -37,6 +37,7 @@ from vibrissa.tools.machine import machine
 
 WON: Final = 0.999
 """Ratio below which a run is won; dead reckoning itself is at 1 up to rounding."""
+TICKS: Final = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 SHOWN: Final = ("sequence, batch", "sequence, lag 100", "sequence, past only")
 
 
@@ -146,6 +147,8 @@ def front(table: Sequence[dict[str, Any]]) -> Figure:
             ax.errorbar(middle, at, xerr=span, fmt="o", ms=3, lw=1, label=noise)
         ax.axvline(1.0, color="0.6", lw=0.8)
         ax.set_xscale("log")
+        ax.set_xticks(TICKS, [f"{tick:g}" for tick in TICKS])
+        ax.minorticks_off()
         ax.set_title(relations)
         ax.set_yticks(range(len(names)), names if k == 0 else [""] * len(names), fontsize=7)
         ax.invert_yaxis()

@@ -45,3 +45,13 @@ def test_circuits_differ_in_speed_and_rest() -> None:
     long = path("CCCCCC")
     lengths = np.diff(long.ends_ns)
     assert len(np.unique(lengths)) == len(lengths)
+
+
+def test_the_heading_wanders_as_asked_for_and_the_wrist_can_follow() -> None:
+    calm = path("CCCCCC", 0.0)
+    turning = CircuitPath(MAZE, PathParams("CCCCCC", 0.1, 0.0, 0.07), 3)
+    t = np.arange(0, calm.duration_ns, STEP)
+    offset = turning.poses(t) - calm.poses(t)
+    assert (offset[:, :3] == 0).all()
+    assert 0.04 < offset[:, 3].std() < 0.1
+    assert np.abs(np.diff(turning.poses(t)[:, 3], 2)).max() / 0.008**2 < 6.0  # rad/s^2
