@@ -20,9 +20,8 @@ from vibrissa.rig.devices.emulation import EmulatorProcess
 from vibrissa.rig.devices.errors import DeviceError
 from vibrissa.rig.devices.rtde_wire import DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT
 
-PRIORITY: Final = 35
-"""SCHED_FIFO of an emulator, where it is granted: below all that has to react, which a real device
-would not keep from running."""
+PRIORITY: Final = 60
+"""SCHED_FIFO of an emulator, where it is granted: a device does not wait for our processes."""
 
 
 @dataclass
