@@ -208,7 +208,8 @@ def odometry_figure(rows: list[Row]) -> Figure:
             ax.plot(range(len(ratios)), ratios, ms=4, lw=0.8, alpha=0.8, **style)
         ax.axhline(1.0, color="tab:green", lw=1)
         ax.set_yscale("log")
-        ax.set_xticks(range(len(EM_SETS)), [n.replace("_", "\n") for n in EM_SETS], fontsize=6)
+        names = [name.replace("_", " ") for name in EM_SETS]
+        ax.set_xticks(range(len(names)), names, rotation=40, ha="right", fontsize=6)
         ax.set_title(f"odometry noise {noise}", fontsize=9, loc="left")
         ax.set_ylabel("EM of the map / EM of its odometry" if noise == noises[0] else "")
     handles = [
