@@ -1,4 +1,4 @@
-"""One bench per kind of device, shared by all tests."""
+"""One bench per kind of device, shared by the tests of a file."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from tests.devices.benches import MAKERS, HeadBench
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="module")
 def head_benches() -> Iterator[Callable[[str], HeadBench]]:
     made: dict[str, HeadBench] = {}
 

@@ -26,6 +26,7 @@ from tests.processes.logs import message
 from vibrissa.messages.log_format import Record
 from vibrissa.messages.log_reader import LogReader
 from vibrissa.messages.recover import recover
+from vibrissa.processes import children as children_of_run
 from vibrissa.processes import supervisor
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.results import RunError
@@ -255,7 +256,7 @@ def test_a_recorder_stopped_for_two_seconds_loses_nothing(tmp_path: Path) -> Non
 def test_a_recorder_stopped_for_good_ends_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(supervisor, "RECORDER_SILENCE", 1.0)
+    monkeypatch.setattr(children_of_run, "RECORDER_SILENCE", 1.0)
     monkeypatch.setattr(supervisor, "CLOSE_S", 0.5)
     schedule = Schedule((0.5, send("recorder", signal.SIGSTOP)))
     out = tmp_path / "run"

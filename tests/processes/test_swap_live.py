@@ -105,10 +105,11 @@ def test_newcomers_that_fail_are_refused_by_name_and_change_nothing(
             broken
         ) and "OSError: calibration table not found" in str(broken)
         assert "hasty could not be loaded: ZeroDivisionError: no first step" in str(hasty)
-        for answer in (mortal, noisy):
-            assert isinstance(answer, str) and answer.endswith("answers in shadow")
+        assert isinstance(mortal, str) and mortal.endswith("answers in shadow")
         run.told("lost", mortal.split("(")[1].split(")")[0], "SIGKILL")
-        run.told("lost", noisy.split("(")[1].split(")")[0], "flooded")
+        # it may flood before it is loaded
+        assert "answers in shadow" in str(noisy) or "failed as soon as it was loaded" in str(noisy)
+        run.told("lost", "flooded")
         monkeypatch.setattr(supervisor, "LOAD_S", 2.0)
         (never,) = at_once(load(run, "never"))
         assert "never could not be loaded" in str(never) and "was not ready after 2 s" in str(never)
@@ -247,4 +248,5 @@ def one_of_two_wins(run: Live, client: Any) -> None:
             heard.append(answers)
             if won:
                 swap_or_skip(client, "open_loop")
+            run.ticks_from_now(400)  # a newcomer that was late has caught up by then
     pytest.fail(f"the two requests never met: {heard}")
