@@ -121,7 +121,7 @@ def live(made: Experiment, out: Path) -> Iterator[Live]:
         run.finish()
 
 
-def swap(client: Client, name: str, patience: float = 60.0) -> str:
+def swap(client: Client, name: str, patience: float = 20.0) -> str:
     """Swap, again and again while a busy machine makes the newcomer late."""
     deadline = time.monotonic() + patience
     while True:
