@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.conftest import Recorded
+from tests.conftest import Recorded, needs_room
 from tests.processes.live import Schedule, wait_for
 from tests.processes.logs import message
 from vibrissa.messages.log_format import LogError
@@ -182,7 +182,10 @@ FAULTS = {
 }
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+FIRST, *OTHERS = FAULTS
+
+
+@pytest.mark.parametrize("fault", [FIRST, *(pytest.param(f, marks=needs_room) for f in OTHERS)])
 def test_a_fault_of_a_device_retracts_the_whiskers_stops_the_arm_and_ends_the_run(
     fault: str, tmp_path: Path
 ) -> None:

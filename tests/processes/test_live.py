@@ -108,8 +108,10 @@ def test_live_and_simulated_runs_of_one_experiment_do_the_same(
         paths.append(np.stack([m.body.pose for m in told if m.t > departure]))
     common = min(map(len, paths))
     assert common > 100
-    # a live arm may hear of the calibration one cycle later, and is then where it has to be
-    np.testing.assert_array_equal(paths[0][2:common], paths[1][2:common])
+    # a live arm may hear of the calibration some cycles later, and is then where it has to be
+    same = (paths[0][:common] == paths[1][:common]).all(axis=1)
+    begins = int(same.argmax())
+    assert begins < 25 and same[begins:].all(), np.flatnonzero(~same)
     if not any(e["kind"] == "fallback" for e in live_run.summary["events"]):
         assert live_run.summary["cycles"] == simulated_run.summary["cycles"]
 
