@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import Recorded
+from tests.conftest import Recorded, thorough
 from tests.processes.simulated_bytes import digests
 
 SCRIPT = Path(__file__).with_name("simulated_bytes.py")
@@ -24,7 +24,12 @@ def here(simulated_run: Recorded, tmp_path_factory) -> list[str]:
 
 @pytest.mark.parametrize(
     "environment",
-    [NO_FMA, OLDEST, {"OPENBLAS_NUM_THREADS": "1"}, {"OPENBLAS_NUM_THREADS": "2"}],
+    [
+        NO_FMA,
+        pytest.param(OLDEST, marks=thorough),
+        {"OPENBLAS_NUM_THREADS": "1"},
+        {"OPENBLAS_NUM_THREADS": "2"},
+    ],
 )
 def test_other_machines_give_the_same_bytes(
     environment: dict[str, str], here: list[str], simulated_run: Recorded, tmp_path: Path, request
