@@ -106,10 +106,9 @@ def touch(
     """
     form, table = int(head[at(FORM, i)]), int(head[at(TIP_TABLE, i)])
     length, taper, rigidity = head[at(LENGTH, i)], head[at(TAPER, i)], head[at(RIGIDITY, i)]
-    chord = length / (
-        1.0 + head[at(TIP_SLIP, i)] * state[at(BEND, i)]
-    )  # of the whisker as it is bent
     psi, gamma, bend = state[at(PSI, i)], state[at(GAMMA, i)], state[at(BEND, i)]
+    # of the whisker as it is bent
+    chord = length / (1.0 + head[at(TIP_SLIP, i)] * bend)
     peg_box, side_box, side = (
         int(state[at(PEG, i)]),
         int(state[at(SIDE_BOX, i)]),
