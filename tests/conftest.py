@@ -20,10 +20,8 @@ from vibrissa.processes.supervisor import run_live
 settings.register_profile("vibrissa", deadline=None)
 settings.load_profile("vibrissa")
 
-EVERYTHING = bool(os.environ.get("VIBRISSA_ALL_TESTS"))
-thorough = pytest.mark.skipif(not EVERYTHING, reason="takes minutes; VIBRISSA_ALL_TESTS=1 runs it")
 needs_room = pytest.mark.skipif(
-    len(os.sched_getaffinity(0)) < 4 and not EVERYTHING,
+    len(os.sched_getaffinity(0)) < 4 and not os.environ.get("VIBRISSA_ALL_TESTS"),
     reason="a live run with emulators or newcomers wants four cores, or VIBRISSA_ALL_TESTS=1",
 )
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import Recorded, thorough
+from tests.conftest import Recorded
 from tests.processes.simulated_bytes import digests
 
 SCRIPT = Path(__file__).with_name("simulated_bytes.py")
@@ -26,7 +26,7 @@ def here(simulated_run: Recorded, tmp_path_factory) -> list[str]:
     "environment",
     [
         NO_FMA,
-        pytest.param(OLDEST, marks=thorough),
+        OLDEST,
         {"OPENBLAS_NUM_THREADS": "1"},
         {"OPENBLAS_NUM_THREADS": "2"},
     ],
