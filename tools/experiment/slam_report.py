@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from vibrissa.numerics import cos, sin
 from vibrissa.tools.console import note, write_json
-from vibrissa.tools.experiment.cache import load
 from vibrissa.tools.experiment.mapping import noisy
 from vibrissa.tools.experiment.report import STYLE, grid, number, picture
 from vibrissa.tools.experiment.scores import RELATIONS, dead_reckoning
@@ -25,10 +24,10 @@ from vibrissa.tools.experiment.slam_runs import (
     NOISES,
     ROWS,
     SlamWork,
+    is_done,
     odometer,
     run_work,
     sequence_map,
-    work_key,
     works,
 )
 from vibrissa.tools.experiment.statistics import geometric_mean, summarise
@@ -63,7 +62,7 @@ def run_all(folder: Path, wanted: Sequence[SlamWork], jobs: int) -> None:
     """
     sets: dict[str, list[SlamWork]] = {}
     for work in wanted:
-        if load(folder, work_key(work)) is None:
+        if not is_done(folder, work):
             sets.setdefault(rig_key(work.rig), []).append(work)
     note(f"{len(sets)} data sets to go")
     if jobs == 1:
