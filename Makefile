@@ -22,7 +22,8 @@ test: $(VENV)/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto -m "not live"
+	$(BIN)/python -m pytest -m live
 
 bench: $(VENV)/installed
 	@for name in $(BENCHES); do $(BIN)/vibrissa bench $$name --out runs/bench || exit 1; done

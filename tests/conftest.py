@@ -96,3 +96,10 @@ def live_run(short: Experiment, tmp_path_factory: pytest.TempPathFactory) -> Rec
     """The short experiment, run live, every node in a process of its own."""
     out = tmp_path_factory.mktemp("runs") / "live"
     return Recorded.of(out, run_live(short, out))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What needs a live run's log needs a live run."""
+    for item in items:
+        if "live_run" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.live)

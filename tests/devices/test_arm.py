@@ -29,6 +29,8 @@ from vibrissa.rig.devices.limits import ARM, ArmLimits, Pose
 from vibrissa.rig.devices.rtde_arm import RtdeArm
 from vibrissa.rig.devices.virtual_arm import VirtualArm
 
+pytestmark = pytest.mark.live
+
 HOST = f"127.0.{os.getpid() % 200 + 1}.7"
 START: Pose = (0.63, 0.09, 0.177, 0.0)
 PATIENT = ArmLimits(stale_ticks=4000, stale_setpoint_ticks=4000, watchdog=0.5, patience=120.0)

@@ -22,6 +22,8 @@ from tests.devices.benches import (
 from vibrissa.rig.devices import protocol
 from vibrissa.rig.devices.errors import DeviceLimit
 
+pytestmark = pytest.mark.live
+
 
 @pytest.fixture(params=list(MAKERS))
 def bench(request: pytest.FixtureRequest, head_benches: Callable[[str], HeadBench]) -> HeadBench:

@@ -28,6 +28,8 @@ from vibrissa.rig.devices.errors import DeviceLost, DeviceRefused, DeviceUnavail
 from vibrissa.rig.devices.head import HeadDevice, Reading
 from vibrissa.rig.devices.serial_head import SerialHead
 
+pytestmark = pytest.mark.live
+
 WIRED = ["serial", "can-loopback"]
 
 

@@ -17,6 +17,8 @@ from vibrissa.messages.errors import DecodeError, TransportError
 from vibrissa.messages.topics import TOPICS
 from vibrissa.messages.transport import BUNDLE, Hub, Port, ZmqPort, check_endpoint
 
+pytestmark = pytest.mark.live
+
 PATIENCE_S = 20.0
 """How long a test waits for something that must happen; never asserted."""
 

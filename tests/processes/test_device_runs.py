@@ -38,6 +38,8 @@ from vibrissa.processes.verify import verify
 from vibrissa.rig.devices.emulation import EmulatorProcess
 from vibrissa.tools.recording import of_log, to_log
 
+pytestmark = pytest.mark.live
+
 FILE = """\
 [run]
 duration = {duration}

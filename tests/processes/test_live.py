@@ -34,6 +34,8 @@ from vibrissa.processes.supervisor import run_live
 from vibrissa.processes.table import PROCESSES
 from vibrissa.processes.verify import verify
 
+pytestmark = pytest.mark.live
+
 
 @pytest.fixture(autouse=True)
 def run_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:

@@ -30,6 +30,8 @@ from vibrissa.processes.realtime import SHADOW_NICE, privileges
 from vibrissa.processes.table import SLOTS
 from vibrissa.processes.verify import verify
 
+pytestmark = pytest.mark.live
+
 PATIENCE_TICKS = 20
 """Samples without an answer after which the built-in controller takes over."""
 

@@ -11,6 +11,8 @@ from vibrissa.processes.calibration_file import from_text
 from vibrissa.processes.config import load_experiment
 from vibrissa.tools.free_whisking import measure, only_whisking
 
+pytestmark = pytest.mark.live
+
 FILE = """\
 [whisk]
 period = 2.0
