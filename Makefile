@@ -22,7 +22,7 @@ test: $(VENV)/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest -n auto -m "not live"
+	$(BIN)/python -m pytest -n auto --dist loadfile -m "not live"
 	$(BIN)/python -m pytest -m live
 
 bench: $(VENV)/installed

@@ -12,7 +12,7 @@ direction. theta is protraction from the start angle. Deflections are base bendi
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -237,6 +237,10 @@ class Event:
     cause: Annotated[str, Text(400)]
 
 
+HOST_ORDERS: Final = ("open", "prepare", "close")
+"""Orders about the process of a slot, which concern the supervisor and the host but no node."""
+
+
 @dataclass(slots=True, eq=False)
 class Order:
     """What a person or a schedule asks of a running node; the node named obeys or refuses."""
@@ -244,7 +248,7 @@ class Order:
     version: ClassVar[int] = 1
     request: Annotated[int, Int(0, 2**31, "number of the request; answers repeat it")]
     kind: Annotated[str, Text(40)]
-    """open, assign, register, swap, rollback, forget, set, close"""
+    """open, prepare, assign, register, swap, rollback, forget, set, close"""
     node: Annotated[str, Text(40)]
     """Who is to obey: "sampler" for the arbiter's orders, else the node concerned."""
     name: Annotated[str, Text(200)]

@@ -43,6 +43,8 @@ LONGEST_WAIT: Final = 8
 """Steps that may wait to be accounted for."""
 RECEIPT_BATCH: Final = 400
 DRAIN_S: Final = 0.005
+PREPARED_TICKS: Final = 400
+"""Ticks for which a slot that is asked to get ready has the priority of a reflex."""
 PARTING_TICKS: Final = 600
 """Ticks a host goes on stepping after its supervisor is gone, so that what moves can stop."""
 
@@ -86,7 +88,7 @@ class Host:
             rehearse(row.name, experiment, layout.controllers.get(row.name))
         self.missing = realtime.prepare(
             max(r.priority for r in rows) if experiment.run.realtime else 0,
-            rows[0].cores,
+            next((r.cores for r in rows if r.cores == "reflex"), rows[0].cores),
         )
         granted = experiment.run.realtime and "SCHED_FIFO" not in self.missing
         self._shadow = name in SLOTS and granted
@@ -120,8 +122,11 @@ class Host:
         self._mark = 0
         self._said = 0
         self._unaccounted: list[tuple[Seat, Step, int, int, int]] = []
+        self._rules = False
+        self._prepared_until = self._priority = 0
+        self._cores = os.sched_getaffinity(0)
         if self._shadow:
-            realtime.set_threads(0)
+            self._favour(0)
 
     def run(self) -> None:
         """Barrier, loop, farewell."""
@@ -248,14 +253,33 @@ class Host:
         self._unaccounted.clear()
 
     def _rule(self, ownership: Ownership) -> None:
-        """A slot runs with the priority of a reflex while it has the drives, or is about to."""
-        rules = ownership.controller == self.name
-        realtime.set_threads(ROWS[self.name].priority if rules else 0)
+        """Note who has the drives, or is about to."""
+        ruled, self._rules = self._rules, ownership.controller == self.name
+        if ruled and not self._rules:  # a rollback may follow
+            self._prepared_until = self.t + PREPARED_TICKS * TICK_NS
+        self._schedule()
+
+    def _schedule(self) -> None:
+        """A slot runs with the priority of a reflex while it has the drives, is about to, or is to
+        show whether it could: who is judged as an ordinary process is judged for the machine's
+        load. It then leaves the core of the reflex loop alone; a shadow is too slow to matter."""
+        wanted = ROWS[self.name].priority if self._rules or self.t < self._prepared_until else 0
+        if wanted != self._priority:
+            self._favour(wanted)
+
+    def _favour(self, priority: int) -> None:
+        self._priority = priority
+        cores = realtime.choose_cores(self._cores, "others" if priority else "any")
+        realtime.set_threads(priority, cores)
 
     def _heed(self, body: Event | Order) -> None:
-        """A stop is for everybody, a close for the slot it names."""
-        if body.kind == "stop" or (body.kind == "close" and body.node in self.nodes):
+        """A stop is for everybody, what else a host obeys is for the slot it names."""
+        named = body.node in self.nodes
+        if body.kind == "stop" or (body.kind == "close" and named):
             self.stopping = True
+        elif body.kind == "prepare" and named and self._shadow:
+            self._prepared_until = self.t + PREPARED_TICKS * TICK_NS
+            self._schedule()
 
     def _publish_own(self, frame: bytes) -> None:
         self.port.publish(frame)
@@ -273,6 +297,8 @@ class Host:
         self._flush(final=False)
         steps = sum(s.steps for s in self.steppers.values())
         self.control.say("beat", t=self.t, steps=steps, done=self._done)
+        if self._shadow:
+            self._schedule()
         for source, (count, cause) in self.gate.take_refused().items():
             self.control.say("refused", source=source, count=count, cause=cause)
         if self._leave_at:

@@ -61,8 +61,9 @@ def set_fifo(priority: int) -> bool:
     return True
 
 
-def set_threads(priority: int) -> None:
-    """Run all threads of this process under SCHED_FIFO, or with priority 0 as favoured others.
+def set_threads(priority: int, cores: set[int]) -> None:
+    """Run all threads of this process under SCHED_FIFO, or with priority 0 as favoured others, on
+    some cores.
 
     A controller in shadow that can't keep up would, under SCHED_FIFO, use up what the kernel allows
     all such processes of a core together, and have the reflex loop suspended for it.
@@ -70,6 +71,7 @@ def set_threads(priority: int) -> None:
     for name in os.listdir("/proc/self/task"):
         thread = int(name)
         with contextlib.suppress(OSError):
+            os.sched_setaffinity(thread, cores)
             if priority:
                 os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
             else:

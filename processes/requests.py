@@ -17,14 +17,15 @@ from vibrissa.messages.types import TICK_HZ, Order, Telemetry
 from vibrissa.processes.config import Experiment, Swap
 from vibrissa.processes.kinds import Kind, of_controllers, of_slams
 from vibrissa.processes.results import RunError
-from vibrissa.processes.table import ALL_SLOTS, PROCESSES
+from vibrissa.processes.table import ALL_SLOTS, PROCESSES, SLOTS
 
 NEXT_CYCLE: Final = "cycle"
 PATIENCE_TICKS: Final = 2000
 """How long, but at least a whisk cycle, a swap is asked for again while a newcomer is late ..."""
 WORTH_RETRYING: Final = ("not ready", "stale", "jump too large")
 """... or its whiskers are elsewhere, as they are when the drives were retracted."""
-RETRY_TICKS: Final = 200
+RETRY_TICKS: Final = 80
+"""Ticks until it is asked for again: in these a newcomer that was prepared can show that it is."""
 ANSWER_PATIENCE_TICKS: Final = 20_000
 LONG: Final = ("parameters", "value")
 """Arguments that may have 2000 characters; others have at most 200."""
@@ -70,6 +71,7 @@ class Requests:
         self._whisks, self._slams = of_controllers(run.experiment), of_slams(run.experiment)
         self.slots = self._whisks.slots
         """slot -> controller, of everything that has the drives or is in shadow"""
+        self._before = ""
         self._loading: list[str] = []
         self._ready: dict[str, float] = {}
         self.shadows: dict[str, dict[str, Any]] = {}
@@ -131,6 +133,8 @@ class Requests:
             case "node.answer":
                 self._answers.setdefault(body.request, []).append((bool(body.accepted), body.text))
             case "head.owner":
+                if body.controller != self._whisks.owner:
+                    self._before = self._whisks.owner
                 self._whisks.owner = body.controller
             case "slam.owner":
                 self._slams.owner = body.controller
@@ -259,11 +263,17 @@ class Requests:
                 break
             if not text.startswith(WORTH_RETRYING) or self._run.tick > deadline:
                 raise RunError(f"swap to {self.slots.get(slot, slot)} refused: {text}")
-            yield from self._wait(RETRY_TICKS)
+            yield from self._prepared(slot)
         accepted, text = yield from self._switched(number, at)
         if not accepted:
             raise RunError(f"swap to {self.slots.get(slot, slot)} refused: {text}")
         return f"{self.slots.get(slot, slot)} ({slot}) {text}"
+
+    def _prepared(self, slot: str) -> Generator[None, None, None]:
+        """Have a slot scheduled as if it had the drives, and give it time to be seen like that."""
+        if slot in SLOTS:
+            self._order("prepare", slot, "")
+        yield from self._wait(RETRY_TICKS)
 
     def _next_cycle(self) -> int:
         """The tick at which the next whisk cycle begins for which an order is in time."""
@@ -272,8 +282,13 @@ class Requests:
         return at if at - self._run.tick >= 10 else at + period
 
     def _rollback(self) -> Program:
-        number = self._order("rollback", "sampler", "")
-        accepted, text = yield from self._answer(number)
+        deadline = self._run.tick + PATIENCE_TICKS
+        while True:
+            number = self._order("rollback", "sampler", "")
+            accepted, text = yield from self._answer(number)
+            if accepted or not text.startswith(WORTH_RETRYING) or self._run.tick > deadline:
+                break
+            yield from self._prepared(self._before)
         if accepted:
             accepted, text = yield from self._answer(number)
         if not accepted:

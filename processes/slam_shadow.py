@@ -10,7 +10,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from vibrissa.messages.codec import Message
-from vibrissa.messages.types import TICK_NS, Answer, Event, Order, SlamHistory, SlamView
+from vibrissa.messages.types import (
+    HOST_ORDERS,
+    TICK_NS,
+    Answer,
+    Event,
+    Order,
+    SlamHistory,
+    SlamView,
+)
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.mapping import IMAGES, Mapping, Sight, Truth
 from vibrissa.processes.node import Output
@@ -34,8 +42,7 @@ class SlamShadowNode:
     def step(self, message: Message) -> Iterable[Output]:
         body = message.body
         if message.topic == "run.order" and body.node == self.name:
-            hosts = body.kind in ("open", "close")  # what the supervisor and the host obey
-            return [] if hosts else [self._assign(body, message.t)]
+            return [] if body.kind in HOST_ORDERS else [self._assign(body, message.t)]
         if self._mapping is None:
             return []
         try:

@@ -20,6 +20,7 @@ from vibrissa.control.drives import Violation, check_command
 from vibrissa.control.kinematics import Float32s, paper_head
 from vibrissa.messages.codec import Message
 from vibrissa.messages.types import (
+    HOST_ORDERS,
     TICK_NS,
     WHISKERS,
     Answer,
@@ -153,6 +154,8 @@ class WhiskNode:
         self._owner = owner
 
     def _obey(self, order: Order, tick: int) -> list[Output]:
+        if order.kind in HOST_ORDERS:
+            return []
         try:
             text = self._assign(order) if order.kind == "assign" else self._set(order)
             accepted = 1

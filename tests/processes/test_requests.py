@@ -14,20 +14,22 @@ from tests.processes.bench import Bench, of
 from vibrissa.messages.codec import Message
 from vibrissa.messages.types import TICK_NS, Answer, HeadReading, Order, WhiskCommand
 from vibrissa.processes.config import Experiment, load_experiment
-from vibrissa.processes.requests import Requests
+from vibrissa.processes.requests import PATIENCE_TICKS, RETRY_TICKS, Requests
 from vibrissa.processes.sampler import SamplerNode
 
 ZERO = np.zeros(18, np.float32)
 
 
 class Desk(Bench):
-    """A sampler with its requests; every loaded controller answers every sample in time."""
+    """A sampler with its requests; every loaded controller answers every sample in time, but one
+    of `starved` only once it is prepared."""
 
     def __init__(self, experiment: Experiment) -> None:
         super().__init__(SamplerNode(experiment))
         self.experiment = experiment
         self.tick = -1
         self.speakers = ["whisk"]
+        self.starved: set[str] = set()
         self.commanded: dict[int, list[str]] = {}
         self.requests = Requests(self)
         self._take(self.decide("start", 0))
@@ -45,6 +47,8 @@ class Desk(Bench):
             assert answer == []  # the sampler leaves alone what is somebody else's
             told = Answer(order.request, max(self.tick, -1), 1, order.node, "answers in shadow")
             self._take([("node.answer", told)])
+        elif order.kind == "prepare":
+            self.starved.discard(order.node)
         else:
             self._take(self.hear("run.order", "supervisor", max(self.tick, 0), order))
 
@@ -61,7 +65,7 @@ class Desk(Bench):
             self.tick += 1
             reading = HeadReading(self.tick, self.tick - 1, ZERO, ZERO, ZERO)
             self._take(self.hear("rig.sample", "rig", self.tick, reading))
-            for source in self.speakers:
+            for source in (s for s in self.speakers if s not in self.starved):
                 body = WhiskCommand(self.tick, ZERO)
                 self._take(self.hear("whisk.command", source, self.tick, body))
             self.requests.poll()
@@ -98,6 +102,40 @@ def test_of_two_clients_that_ask_at_once_one_wins_and_the_other_is_told(
     assert why.startswith("swap to mimc refused: already switching: to whisk.1#0 at tick 102")
     one_owner(desk)
     assert desk.commanded[101] == ["whisk"] and desk.commanded[102] == ["whisk.1"]
+
+
+@pytest.mark.parametrize("back", [False, True])
+def test_a_starved_newcomer_is_prepared_before_it_is_asked_for_again(
+    experiment: Experiment, back: bool
+) -> None:
+    desk = Desk(experiment)
+    desk.ask("load", name="rcp")
+    desk.run(100)
+    if back:  # the same on the way back, for a controller that had the drives before
+        for name in ("rcp", "open_loop"):
+            desk.ask("swap", name=name)
+            desk.run(10)
+    desk.starved.add("whisk.1")
+    desk.run(100)
+    answers = desk.ask("rollback") if back else desk.ask("swap", name="rcp")
+    desk.run(RETRY_TICKS + 10)
+    assert desk.starved == set()
+    assert [accepted for accepted, _ in answers] == [True]
+    one_owner(desk)
+    assert desk.commanded[desk.tick] == ["whisk.1"]
+
+
+def test_a_newcomer_that_is_late_even_when_prepared_is_refused(experiment: Experiment) -> None:
+    desk = Desk(experiment)
+    desk.ask("load", name="rcp")
+    desk.run(100)
+    desk.speakers.remove("whisk.1")
+    desk.run(100)
+    answers = desk.ask("swap", name="rcp")
+    desk.run(PATIENCE_TICKS + RETRY_TICKS + 10)
+    ((accepted, why),) = answers
+    assert not accepted and why.startswith("swap to rcp refused: stale: no fresh answer")
+    assert desk.commanded[desk.tick] == ["whisk"]
 
 
 VERBS = st.sampled_from(
