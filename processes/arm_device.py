@@ -104,7 +104,7 @@ class ArmPump(Pump):
     def counters(self) -> dict[str, int]:
         return dataclasses.asdict(self._arm.counters)
 
-    def housekeep(self) -> None:
+    def look_at_device(self) -> None:
         if self._said:
             stamp = round(self._arm.report.stamp * 1e9)
             self.say_clock("arm", self._arm.clock, stamp)

@@ -108,7 +108,7 @@ class HeadPump(Pump):
     def counters(self) -> dict[str, int]:
         return dataclasses.asdict(self._head.counters)
 
-    def housekeep(self) -> None:
+    def look_at_device(self) -> None:
         if self._base is not None:
             device_ns = self._reading.device_us * 1000
             host_ns = self.say_clock("head", self._head.clock, device_ns)

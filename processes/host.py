@@ -15,29 +15,20 @@ import traceback
 from collections.abc import Callable, Generator
 from typing import Any, Final
 
-import numpy as np
-import zmq
-
 from vibrissa.messages.codec import CODECS, header
 from vibrissa.messages.errors import DecodeError, MessageError
-from vibrissa.messages.transport import ZmqPort
-from vibrissa.messages.types import TICK_NS, Event, Order, Ownership, Telemetry
+from vibrissa.messages.types import TICK_NS, Event, Order, Ownership
 from vibrissa.processes import realtime
 from vibrissa.processes.config import Experiment
-from vibrissa.processes.control import ControlLine
-from vibrissa.processes.gate import Gate
 from vibrissa.processes.group import Group, Steps
 from vibrissa.processes.layout import Layout
+from vibrissa.processes.member import Member, telemetry
 from vibrissa.processes.node import Step, Stepper, counters, timer_frame
 from vibrissa.processes.receipts import ReceiptBook
 from vibrissa.processes.rehearsal import rehearse
 from vibrissa.processes.stats import Clocking
 from vibrissa.processes.table import ROWS, SLOTS, Process, build
 
-HOUSEKEEPING_NS: Final = 50_000_000
-"""How often receipts are handed in, so that a crash costs few."""
-BUNDLE_NS: Final = 10_000_000
-"""How often bundled listeners are served: what a crash of this process may take from the log."""
 HEEDED: Final = ("run.event", "run.order")
 LONGEST_WAIT: Final = 8
 """Steps that may wait to be accounted for."""
@@ -45,8 +36,6 @@ RECEIPT_BATCH: Final = 400
 DRAIN_S: Final = 0.005
 PREPARED_TICKS: Final = 400
 """Ticks for which a slot that is asked to get ready has the priority of a reflex."""
-PARTING_TICKS: Final = 600
-"""Ticks a host goes on stepping after its supervisor is gone, so that what moves can stop."""
 
 
 class Seat:
@@ -73,12 +62,10 @@ class Seat:
             self.clock.latency.add((now - went) * 1e-3)
 
 
-class Host:
-    """One process of a live run."""
+class Host(Member):
+    """One process of a live run, with one node or several."""
 
     def __init__(self, name: str, layout: Layout) -> None:
-        self.name = name
-        self.layout = layout
         self.nodes = layout.hosts.get(name, [name])
         rows = [ROWS[n] for n in self.nodes]
         self.pacing = rows[0].pacing
@@ -86,39 +73,19 @@ class Host:
         self.last_tick = experiment.ticks
         for row in rows:
             rehearse(row.name, experiment, layout.controllers.get(row.name))
-        self.missing = realtime.prepare(
-            max(r.priority for r in rows) if experiment.run.realtime else 0,
-            next((r.cores for r in rows if r.cores == "reflex"), rows[0].cores),
-        )
+        priority = max(r.priority for r in rows) if experiment.run.realtime else 0
+        cores = next((r.cores for r in rows if r.cores == "reflex"), rows[0].cores)
+        super().__init__(name, layout, priority, cores)
         granted = experiment.run.realtime and "SCHED_FIFO" not in self.missing
         self._shadow = name in SLOTS and granted
-        self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self.control = ControlLine(self.context, layout.endpoints["control"], name)
-        self.control.say("hello", pid=os.getpid(), missing=self.missing)
-        self.port = ZmqPort(
-            self.context,
-            layout.endpoints[name],
-            layout.hears(name),
-            layout.connections(name),
-            bundled=layout.bundled(name),
-        )
         self.steppers = {
             n: Stepper(n, build(n, experiment), publish=self._publish) for n in self.nodes
         }
         self.seats = {row.name: Seat(row) for row in rows}
         self.group = Group([(self.steppers[r.name], r.hears) for r in rows], self._stepped)
-        self.gate = Gate()
-        self.sent: collections.Counter[str] = collections.Counter()
-        self.t0 = 0
         self.t = 0
-        self.stopping = False
-        self._done = False
         self._own_seq: collections.Counter[tuple[str, str]] = collections.Counter()
-        self._housekept = 0
-        self._flushed = 0
         self._reported = 0
-        self._parent = os.getppid()
-        self._leave_at = 0
         self._mark = 0
         self._said = 0
         self._unaccounted: list[tuple[Seat, Step, int, int, int]] = []
@@ -145,7 +112,8 @@ class Host:
         except Exception as error:
             traceback.print_exc()
             self.control.say("fault", cause=f"{type(error).__name__}: {error}"[:400])
-        self._flush(final=True)
+        self._hand_in(final=True)
+        self.port.flush()
         for stepper in self.steppers.values():
             self.sent.update(stepper.sent)
         self.control.say(
@@ -155,17 +123,18 @@ class Host:
             cpu_s=time.process_time() - cpu,
             counters={n: counters(s) for n, s in self.steppers.items()},
         )
-        self._wait_to_leave()
+        self.control.wait_to_leave(self.parent)
+        self.leave()
 
     def _wait_for_go(self) -> Generator[None, None, None]:
         wanted = self.layout.audience(self.name)
-        self.t0 = yield from self.control.wait_for_go(self._parent, self.port.subscribers, wanted)
+        self.t0 = yield from self.control.wait_for_go(self.parent, self.port.subscribers, wanted)
 
     def _timer_loop(self) -> None:
         tick = 0
         while not self.stopping:
             if tick >= self.last_tick:
-                self._done = True
+                self.done = True
                 frame = self.port.receive(0.02)
                 if frame is not None:
                     self._hear(frame)
@@ -177,14 +146,14 @@ class Host:
                     break
                 self._feed(timer_frame(self.nodes[0], tick))
                 tick += 1
-            self._housekeep()
+            self.housekeep()
 
     def _arrival_loop(self) -> None:
         while not self.stopping:
             frame = self.port.receive(0.05)
             if frame is not None:
                 self._hear(frame)
-            self._housekeep()
+            self.housekeep()
 
     def _drain_loop(self) -> None:
         while not self.stopping:
@@ -197,7 +166,7 @@ class Host:
                 time.sleep(DRAIN_S)
             else:
                 self._hear(frame)
-            self._housekeep()
+            self.housekeep()
 
     def _hear(self, frame: bytes) -> None:
         """Take a frame from the bus, unless it is none that this process may hear."""
@@ -285,29 +254,19 @@ class Host:
         self.port.publish(frame)
         self.sent[frame[: frame.find(b"\0")].decode()] += 1
 
-    def _housekeep(self) -> None:
-        now = time.monotonic_ns()
-        if now - self._flushed < BUNDLE_NS:
-            return
-        self._flushed = now
-        if now - self._housekept < HOUSEKEEPING_NS:
-            self.port.flush()
-            return
-        self._housekept = now
-        self._flush(final=False)
-        steps = sum(s.steps for s in self.steppers.values())
-        self.control.say("beat", t=self.t, steps=steps, done=self._done)
+    def progress(self) -> tuple[int, int]:
+        return self.t, sum(s.steps for s in self.steppers.values())
+
+    def look_after(self) -> None:
+        self._hand_in(final=False)
         if self._shadow:
             self._schedule()
-        for source, (count, cause) in self.gate.take_refused().items():
-            self.control.say("refused", source=source, count=count, cause=cause)
-        if self._leave_at:
-            self.stopping |= now >= self._leave_at
-        elif os.getppid() != self._parent:
-            self._leave_at = now + PARTING_TICKS * TICK_NS
-            self._inject("stop", "supervisor gone")
 
-    def _flush(self, *, final: bool) -> None:
+    def orphaned(self) -> None:
+        self._inject("stop", "supervisor gone")
+
+    def _hand_in(self, *, final: bool) -> None:
+        """Publish the receipts so far, so that a crash costs few, and every second telemetry."""
         self._account()
         for seat in self.seats.values():
             if len(seat.book):
@@ -316,20 +275,8 @@ class Host:
         if final or now - self._reported > 1_000_000_000:
             self._reported = now
             for node in self.nodes:
-                self._publish_own(self._telemetry(node))
-        self.port.subscribers()
-        self.port.flush()
-
-    def _telemetry(self, node: str) -> bytes:
-        clock = self.seats[node].clock
-        body = Telemetry(
-            steps=self.steppers[node].steps,
-            lateness_us=np.array(clock.lateness.recent(), np.float32),
-            work_us=np.array(clock.work.recent(), np.float32),
-            latency_us=np.array(clock.latency.recent(), np.float32),
-            cpu_s=time.process_time(),
-        )
-        return self._own_frame("node.telemetry", node, body)
+                body = telemetry(self.seats[node].clock, self.steppers[node].steps)
+                self._publish_own(self._own_frame("node.telemetry", node, body))
 
     def _own_frame(self, topic: str, node: str, body: Any) -> bytes:
         seq = self._own_seq[topic, node]
@@ -343,12 +290,6 @@ class Host:
             frame = self._own_frame("host.event", node, event)
             self._publish_own(frame)
             self._feed(frame)
-
-    def _wait_to_leave(self) -> None:
-        self.control.wait_to_leave(self._parent)
-        self.control.close()
-        self.port.close()
-        self.context.term()
 
 
 def main(name: str, layout: Layout) -> None:

@@ -7,26 +7,18 @@ its device while the run warms up, reads it from then on, and lets nothing move 
 
 from __future__ import annotations
 
-import collections
-import os
 import signal
 import time
 import traceback
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from typing import Any, Final
-
-import numpy as np
-import zmq
 
 from vibrissa.messages.codec import CODECS, Message, decode, header
 from vibrissa.messages.errors import DecodeError
-from vibrissa.messages.transport import ZmqPort
-from vibrissa.messages.types import TICK_NS, DeviceClock, Event, Telemetry
-from vibrissa.processes import realtime
+from vibrissa.messages.types import TICK_NS, DeviceClock, Event
 from vibrissa.processes.config import Experiment
-from vibrissa.processes.control import ControlLine
-from vibrissa.processes.gate import Gate
 from vibrissa.processes.layout import Layout
+from vibrissa.processes.member import Member, telemetry
 from vibrissa.processes.results import RunError, one_line
 from vibrissa.processes.stats import Clocking
 from vibrissa.processes.table import DEVICES
@@ -36,44 +28,26 @@ from vibrissa.rig.devices.errors import DeviceError
 from vibrissa.rig.devices.head import HeadDevice
 from vibrissa.rig.devices.watch import Watch
 
-BUNDLE_NS: Final = 10_000_000
-HOUSEKEEPING_NS: Final = 50_000_000
 TELEMETRY_NS: Final = 1_000_000_000
-PARTING_TICKS: Final = 600
-"""Ticks it goes on for after its supervisor is gone, so that what moves can stop."""
 
 
-class Pump(ABC):
+class Pump(Member):
     """One device of a live run. A subclass opens and reads it, and takes what the bus says."""
 
     device: HeadDevice | ArmDevice
     watch: Watch
 
     def __init__(self, name: str, layout: Layout) -> None:
-        self.name = name
-        self.layout = layout
         self.experiment = Experiment.model_validate_json(layout.experiment)
         row = DEVICES[name]
-        wanted = row.priority if self.experiment.run.realtime else 0
-        missing = realtime.prepare(wanted, row.cores)
-        self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self.control = ControlLine(self.context, layout.endpoints["control"], name)
-        self.control.say("hello", pid=os.getpid(), missing=missing)
-        self.port = ZmqPort(
-            self.context, layout.endpoints[name], layout.hears(name), layout.connections(name)
+        super().__init__(
+            name, layout, row.priority if self.experiment.run.realtime else 0, row.cores
         )
-        self.gate = Gate()
         self.clock = Clocking()
-        self.sent: collections.Counter[str] = collections.Counter()
         self.last_tick = self.experiment.ticks
-        self.t0 = 0
         self.tick = 0
         self.steps = 0
-        self.done = False
-        self.stopping = False
-        self._parent = os.getppid()
-        self._leave_at = 0
-        self._flushed = self._housekept = self._accounted = 0
+        self._accounted = 0
 
     def run(self) -> None:
         """Open, barrier, loop, farewell; SystemExit when the device can't be used."""
@@ -81,13 +55,13 @@ class Pump(ABC):
             self._prepare()
         except (DeviceError, RunError) as error:
             self.control.say("fault", cause=str(error)[:400])
-            self._leave()
+            self.leave()
             raise SystemExit(2) from None
         cpu = time.process_time()
         try:
             while not self.stopping:
                 self.turn()
-                self._housekeep()
+                self.housekeep()
         except DeviceError as error:
             self.give_up(str(error))
         except Exception as error:
@@ -104,8 +78,8 @@ class Pump(ABC):
             cpu_s=time.process_time() - cpu,
             counters={self.name: self.counters()},
         )
-        self.control.wait_to_leave(self._parent)
-        self._leave()
+        self.control.wait_to_leave(self.parent)
+        self.leave()
 
     def _prepare(self) -> None:
         """Open the device, wait for the others and for the go, reading on meanwhile."""
@@ -113,7 +87,7 @@ class Pump(ABC):
         try:
             self.opened()
             wanted = self.layout.audience(self.name)
-            waiting = self.control.wait_for_go(self._parent, self.port.subscribers, wanted)
+            waiting = self.control.wait_for_go(self.parent, self.port.subscribers, wanted)
             while True:
                 next(waiting)
                 self.drain()
@@ -122,11 +96,6 @@ class Pump(ABC):
         except BaseException:
             self.device.close()
             raise
-
-    def _leave(self) -> None:
-        self.control.close()
-        self.port.close()
-        self.context.term()
 
     @abstractmethod
     def opened(self) -> None:
@@ -210,42 +179,24 @@ class Pump(ABC):
         self.say("rig.clock", DeviceClock(device, self.tick, device_ns, host_ns, drift))
         return host_ns
 
-    def _housekeep(self) -> None:
+    def progress(self) -> tuple[int, int]:
+        return self.tick * TICK_NS, self.steps
+
+    def look_after(self) -> None:
+        self.look_at_device()
         now = time.monotonic_ns()
-        if now - self._flushed < BUNDLE_NS:
-            return
-        self._flushed = now
-        if now - self._housekept < HOUSEKEEPING_NS:
-            self.port.flush()
-            return
-        self._housekept = now
-        self.port.subscribers()
-        self.housekeep()
         if now - self._accounted > TELEMETRY_NS:
             self._accounted = now
             self._account()
-        self.port.flush()
-        self.control.say("beat", t=self.tick * TICK_NS, steps=self.steps, done=self.done)
-        for source, (count, cause) in self.gate.take_refused().items():
-            self.control.say("refused", source=source, count=count, cause=cause)
-        if self._leave_at:
-            self.stopping |= now >= self._leave_at
-        elif os.getppid() != self._parent:
-            self._leave_at = now + PARTING_TICKS * TICK_NS
-            self.give_up("supervisor gone")
 
-    def housekeep(self) -> None:  # noqa: B027
+    def orphaned(self) -> None:
+        self.give_up("supervisor gone")
+
+    def look_at_device(self) -> None:
         """Some twenty times a second."""
 
     def _account(self) -> None:
-        body = Telemetry(
-            steps=self.steps,
-            lateness_us=np.array(self.clock.lateness.recent(), np.float32),
-            work_us=np.array(self.clock.work.recent(), np.float32),
-            latency_us=np.array(self.clock.latency.recent(), np.float32),
-            cpu_s=time.process_time(),
-        )
-        self.say("node.telemetry", body)
+        self.say("node.telemetry", telemetry(self.clock, self.steps))
 
 
 def main(name: str, layout: Layout) -> None:

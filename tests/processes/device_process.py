@@ -14,7 +14,7 @@ import pytest
 from tests.devices.stepped import TICK_NS, HandClock, MutableArm, stepped_head
 from vibrissa.messages.codec import CODECS, Message, decode
 from vibrissa.messages.types import ArmSetpoint, DeviceClock, Event, HeadCommand
-from vibrissa.processes import arm_device, head_device, pump
+from vibrissa.processes import arm_device, head_device, member, pump
 from vibrissa.processes.arm import make_path
 from vibrissa.processes.arm_device import ArmPump
 from vibrissa.processes.config import Experiment, load_experiment
@@ -103,11 +103,11 @@ class World:
 
     def __init__(self, patch: pytest.MonkeyPatch, experiment: Experiment, name: str) -> None:
         self.clock = HandClock()
-        self.clock.put_into(patch, pump, head_device, arm_device)
+        self.clock.put_into(patch, member, pump, head_device, arm_device)
         self.bus = Bus(self.clock)
-        patch.setattr(pump, "ControlLine", lambda *_: self.bus)
-        patch.setattr(pump, "ZmqPort", lambda *_: self.bus)
-        patch.setattr(pump.realtime, "prepare", lambda *_: [])
+        patch.setattr(member, "ControlLine", lambda *_: self.bus)
+        patch.setattr(member, "ZmqPort", lambda *_, **__: self.bus)
+        patch.setattr(member.realtime, "prepare", lambda *_: [])
         others = [n for n in PROCESSES if n != "rig"]
         hosts = {n: [n] for n in (*DEVICES, *others)}
         names = ("control", "supervisor", "recorder", *hosts, *ALL_SLOTS)
