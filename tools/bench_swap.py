@@ -37,6 +37,7 @@ from vibrissa.processes.supervisor import Supervisor
 from vibrissa.processes.verify import verify
 from vibrissa.tools.bench import Bench, Target
 from vibrissa.tools.floors import PRIORITY
+from vibrissa.tools.machine import ROOMY
 from vibrissa.tools.run import next_directory
 
 if TYPE_CHECKING:
@@ -47,8 +48,6 @@ PAIR: Final = ("open_loop", "rcp")
 TOGETHER: Final = [["rig", "sampler", "whisk"], ["arm", "slam"]]
 """Two cores have no room for a process per node beside a newcomer and other people's work: one
 hosts the loop, another what is slow, and the newcomer has one of its own as always."""
-ROOMY: Final = 4
-"""Cores on which every node has a process of its own."""
 QUIET_S: Final = 15.0
 """Ticks without swaps, before the first one."""
 SETTLE_S: Final = 4.0

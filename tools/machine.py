@@ -26,6 +26,10 @@ LIBRARIES: Final = (
 )
 
 
+ROOMY: Final = 4
+"""Cores from which on every node of a live run and a newcomer have room in processes of their own."""
+
+
 def machine() -> dict[str, Any]:
     """CPU, cores, kernel, Python and library versions, privileges granted, load at this moment."""
     import zmq
@@ -93,6 +97,11 @@ def advice() -> list[str]:
     cores = len(os.sched_getaffinity(0))
     if cores < 2:
         lines.append(f"{cores} core: a live run wants two")
+    elif cores < ROOMY:
+        lines.append(
+            f'{cores} cores: [run] together = [["rig", "sampler", "whisk"], ["arm", "slam"]] '
+            "leaves more of them to others (docs/architecture.md)"
+        )
     if os.getloadavg()[0] > 0.5 * cores:
         lines.append(f"load {os.getloadavg()[0]:.1f}: other work will make ticks late")
     if governor() not in ("performance", "none visible"):
