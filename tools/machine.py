@@ -27,7 +27,7 @@ LIBRARIES: Final = (
 
 
 ROOMY: Final = 4
-"""Cores from which on every node of a live run and a newcomer have room in processes of their own."""
+"""Cores from which on nodes of a live run and newcomers have room in processes of their own."""
 
 
 def machine() -> dict[str, Any]:
