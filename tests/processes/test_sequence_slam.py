@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.processes.test_swap_between_cycles import said
@@ -24,13 +25,13 @@ CORNERS = """\
 """
 
 
-def made(folder: Path, slam: str, swaps: str = "") -> Experiment:
+def made(folder: Path, slam: str, swaps: str = "", duration: float = 9.0) -> Experiment:
     (folder / "corners.maze").write_text(CORNERS)
     path = folder / "experiment.toml"
     path.write_text(
         f"""\
 [run]
-duration = 9
+duration = {duration}
 [maze]
 file = "corners.maze"
 [whisk]
@@ -41,7 +42,7 @@ speed = 0.25
 lift = 0.05
 sequence = "CCCCCC"
 [slam]
-image = "contact_angle"
+{"" if "image =" in slam else 'image = "contact_angle"'}
 {slam}
 {swaps}
 """
@@ -86,6 +87,24 @@ def test_as_the_runs_first_slam_it_maps_every_whisk_and_the_log_re_runs(tmp_path
     assert verdict.identical, verdict.first_difference
 
 
+def test_loops_that_were_closed_in_a_run_are_closed_again_to_the_byte(tmp_path: Path) -> None:
+    parameters = "parameters = { lag = 10, gap = 6, evidence = 0.5, compass = true }"
+    out = tmp_path / "run"
+    slam = f'algorithm = "sequence"\n{parameters}\nodometry_noise = "third"'
+    assert simulate(made(tmp_path, slam, duration=34.0), out)["cause"] == "completed"
+    last = said(out, "slam.map")["slam"][-1]
+    loops = last.links[len(last.poses) - 1 :]
+    assert len(loops) >= 5
+    poses = said(out, "slam.pose")["slam"]
+    place = np.array([pose.truth[:2] for pose in poses])
+    apart = np.hypot(*(place[loops[:, 0]] - place[loops[:, 1]]).T)
+    assert np.median(apart) < 0.1, "loops join whisks at one place"
+    assert min(pose.experience - k for k, pose in enumerate(poses)) < 0, "recognised on the way"
+    for executor in ("fused", "lockstep"):
+        verdict = verify(out / "run.mcap", executor)
+        assert verdict.identical, verdict.first_difference
+
+
 @pytest.mark.parametrize(
     ("slam", "words"),
     [
@@ -101,6 +120,10 @@ def test_as_the_runs_first_slam_it_maps_every_whisk_and_the_log_re_runs(tmp_path
         (
             'algorithm = "sequence"\nparameters = { odometer_turn = 0.0 }',
             "slam.parameters.odometer_turn: expected a finite number > 0, found 0.0",
+        ),
+        (
+            'image = "max_angle_gated"\nalgorithm = "sequence"\nparameters = { compass = true }',
+            "slam.parameters.compass: expected slam.image 'contact_angle' with it",
         ),
         ('algorithm = "cartographer"', "'cartographer': expected one of ratslam, sequence"),
     ],
