@@ -130,36 +130,40 @@ def follow(
 
     heading float64[3]: since the first whisk, that of the last step, and the variance relative to
     the walls that are followed; walls float64[2, 2]: direction of the wall on either side, and for
-    how many whisks it did not show. A scalar Kalman filter of the heading. Whiskers touch near
+    how many whisks it did not show. A Kalman filter of the heading. Whiskers touch near
     mid-whisk, where the heading is the mean of those before and after the step.
     """
-    now = heading[SUM] + turn
-    heading[VARIANCE] += sigma * sigma
+    before = heading[SUM]
+    now = before + turn
+    middle = before + 0.5 * turn
     walls[:, UNSEEN_FOR] += 1.0
     if abs(turn) >= TURNING:
         walls[:, UNSEEN_FOR] = LOST
-    known = (walls[:, UNSEEN_FOR] <= UNSEEN).any()
-    if not known:
-        heading[VARIANCE] = 0.0
-    noise = wall_sigma * wall_sigma
+    step = sigma * sigma
+    now_variance, middle_variance, shared = 0.25 * step, 0.0, 0.0  # to a wall that is new
+    if (walls[:, UNSEEN_FOR] <= UNSEEN).any():
+        now_variance = heading[VARIANCE] + step
+        middle_variance = heading[VARIANCE] + 0.25 * step
+        shared = heading[VARIANCE] + 0.5 * step
     touched = False
     for side in range(SIDES):
         if math.isnan(lines[side]) or walls[side, UNSEEN_FOR] > UNSEEN:
             continue
-        surprise = walls[side, DIRECTION] - lines[side] - 0.5 * (heading[SUM] + now)
-        variance = heading[VARIANCE] + noise
+        surprise = walls[side, DIRECTION] - lines[side] - middle
+        variance = middle_variance + wall_sigma * wall_sigma
         if surprise * surprise > SURPRISE * SURPRISE * variance:
             continue
-        gain = heading[VARIANCE] / variance
-        now += gain * surprise
-        heading[VARIANCE] *= 1.0 - gain
+        now += shared / variance * surprise
+        middle += middle_variance / variance * surprise
+        now_variance -= shared * shared / variance
+        shared -= shared * middle_variance / variance
+        middle_variance -= middle_variance * middle_variance / variance
         walls[side, UNSEEN_FOR] = 0.0
         touched = True
     for side in range(SIDES):
         new = walls[side, UNSEEN_FOR] > UNSEEN and abs(turn) < TURNING
         if new and not math.isnan(lines[side]):
-            walls[side, DIRECTION] = 0.5 * (heading[SUM] + now) + lines[side]
+            walls[side, DIRECTION] = middle + lines[side]
             walls[side, UNSEEN_FOR] = 0.0
-    heading[STEP] = now - heading[SUM]
-    heading[SUM] = now
+    heading[SUM], heading[STEP], heading[VARIANCE] = now, now - before, now_variance
     return touched

@@ -270,7 +270,16 @@ class SequenceSlam:
             belief.new = max(1.0 - float(known.sum()), 0.0)
             belief.known = known
 
-    def _solved(self) -> SlamMap:
+    def pose_graph(self) -> tuple[Floats, Ints, NDArray[np.int8]]:
+        """What the map of at least one whisk is solved from, every whisk decided: steps
+        float64[n - 1, 4], loops int64[m, 2] and facing int8[m] as in `graph_start.start_values`."""
+        loops = self._all_loops()
+        ends, facing = self._ordered(loops)
+        trust = self._trust.copied()
+        trust.look_at(ends, facing, self._reckoning.travelled)
+        return self._trusted(trust, 0), ends, facing
+
+    def _all_loops(self) -> Loops:
         n = self._memory.count
         loops = self._loops.copied()
         if self.config.lag == BATCH:
@@ -283,16 +292,18 @@ class SequenceSlam:
                 found = self._find(first + k, posterior, loops)
                 if len(found):
                     loops.add(first + k, found, self._memory.whisk)
-        poses = np.zeros((0, 3))
-        ends, facing = self._ordered(loops)
-        if n:
-            trust = self._trust.copied()
-            trust.look_at(ends, facing, self._reckoning.travelled)
-            steps = self._trusted(trust, 0)
-            poses = solve_unwound(self._poses[0], steps, ends, facing, self._graph).poses
+        return loops
+
+    def _solved(self) -> SlamMap:
+        n = self._memory.count
+        if n == 0:
+            none = np.zeros((0, 2), dtype=np.int32)
+            return SlamMap(np.zeros((0, 3)), none, self._memory.kind_of.copy())
+        steps, ends, facing = self.pose_graph()
+        poses = solve_unwound(self._poses[0], steps, ends, facing, self._graph).poses
         for pose in poses:
             pose[2] = wrap_pi(float(pose[2]))
-        chain = np.stack([np.arange(n - 1), np.arange(1, n)], axis=1) if n else ends
+        chain = np.stack([np.arange(n - 1), np.arange(1, n)], axis=1)
         links = np.concatenate([chain, ends]).astype(np.int32)
         return SlamMap(poses, links, self._memory.kind_of.copy())
 

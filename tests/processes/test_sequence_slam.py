@@ -25,6 +25,15 @@ CORNERS = """\
 """
 
 
+CRANK = """\
++---+---+---+
+|   |       |
++   +---+   +
+|       |   |
++---+---+---+
+"""
+
+
 def made(folder: Path, slam: str, swaps: str = "", duration: float = 9.0) -> Experiment:
     (folder / "corners.maze").write_text(CORNERS)
     path = folder / "experiment.toml"
