@@ -130,40 +130,33 @@ def follow(
 
     heading float64[3]: since the first whisk, that of the last step, and the variance relative to
     the walls that are followed; walls float64[2, 2]: direction of the wall on either side, and for
-    how many whisks it did not show. A Kalman filter of the heading. Whiskers touch near
-    mid-whisk, where the heading is the mean of those before and after the step.
+    how many whisks it did not show. A scalar Kalman filter of the heading; that whiskers touch
+    near mid-whisk, half a step earlier, it leaves out: odometry's noise is larger than that.
     """
-    before = heading[SUM]
-    now = before + turn
-    middle = before + 0.5 * turn
+    now = heading[SUM] + turn
     walls[:, UNSEEN_FOR] += 1.0
     if abs(turn) >= TURNING:
         walls[:, UNSEEN_FOR] = LOST
-    step = sigma * sigma
-    now_variance, middle_variance, shared = 0.25 * step, 0.0, 0.0  # to a wall that is new
-    if (walls[:, UNSEEN_FOR] <= UNSEEN).any():
-        now_variance = heading[VARIANCE] + step
-        middle_variance = heading[VARIANCE] + 0.25 * step
-        shared = heading[VARIANCE] + 0.5 * step
+    followed = (walls[:, UNSEEN_FOR] <= UNSEEN).any()
+    uncertain = heading[VARIANCE] + sigma * sigma if followed else 0.0
     touched = False
     for side in range(SIDES):
         if math.isnan(lines[side]) or walls[side, UNSEEN_FOR] > UNSEEN:
             continue
-        surprise = walls[side, DIRECTION] - lines[side] - middle
-        variance = middle_variance + wall_sigma * wall_sigma
+        surprise = walls[side, DIRECTION] - lines[side] - now
+        variance = uncertain + wall_sigma * wall_sigma
         if surprise * surprise > SURPRISE * SURPRISE * variance:
             continue
-        now += shared / variance * surprise
-        middle += middle_variance / variance * surprise
-        now_variance -= shared * shared / variance
-        shared -= shared * middle_variance / variance
-        middle_variance -= middle_variance * middle_variance / variance
+        gain = uncertain / variance
+        now += gain * surprise
+        uncertain *= 1.0 - gain
         walls[side, UNSEEN_FOR] = 0.0
         touched = True
     for side in range(SIDES):
         new = walls[side, UNSEEN_FOR] > UNSEEN and abs(turn) < TURNING
         if new and not math.isnan(lines[side]):
-            walls[side, DIRECTION] = middle + lines[side]
+            walls[side, DIRECTION] = now + lines[side]
             walls[side, UNSEEN_FOR] = 0.0
-    heading[SUM], heading[STEP], heading[VARIANCE] = now, now - before, now_variance
+    heading[STEP] = now - heading[SUM]
+    heading[SUM], heading[VARIANCE] = now, uncertain
     return touched

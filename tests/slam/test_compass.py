@@ -90,13 +90,11 @@ def followed(
     heading, walls = np.zeros(3), np.zeros((2, 2))
     walls[:, 1] = LOST
     said, known = [], []
-    before = 0.0
     for true, turn, visible in zip(headings, turns, shown, strict=True):
-        line = -0.5 * (true + before)
+        line = -true
         lines = np.array([line, np.nan]) if visible else np.full(2, np.nan)
         known.append(follow(heading, walls, lines, turn, sigma, 0.01))
         said.append(heading[0])
-        before = true
     return np.array(said), np.array(known)
 
 
