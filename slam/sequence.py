@@ -300,7 +300,9 @@ class SequenceSlam:
             none = np.zeros((0, 2), dtype=np.int32)
             return SlamMap(np.zeros((0, 3)), none, self._memory.kind_of.copy())
         steps, ends, facing = self.pose_graph()
-        poses = solve_unwound(self._poses[0], steps, ends, facing, self._graph).poses
+        poses = solve_unwound(
+            self._poses[0], steps, ends, facing, self._graph, self.config.doubt
+        ).poses
         for pose in poses:
             pose[2] = wrap_pi(float(pose[2]))
         chain = np.stack([np.arange(n - 1), np.arange(1, n)], axis=1)

@@ -40,6 +40,8 @@ class SequenceConfig:
     lateral: m, standard deviation of sideways motion per whisk.
     loop_place, loop_heading: m and rad, standard deviation of a loop.
     robust: chi^2 (3 degrees of freedom) at which a loop's pull is a quarter.
+    doubt: rad, by how much the heading of a loop must surprise for its whole turns to be tried the
+        other way too when the map is solved.
     compass: correct the turn of every step by the walls that are touched (see compass); the image
         has to be that of contact angles.
     compass_wall: rad, standard deviation of a wall's direction.
@@ -67,6 +69,7 @@ class SequenceConfig:
     loop_place: float = 0.015
     loop_heading: float = 0.1
     robust: float = 9.0
+    doubt: float = 2.0
     compass: bool = False
     compass_wall: float = 0.01
     odometer: OdometerNoise = field(default_factory=OdometerNoise)
@@ -119,6 +122,7 @@ _RANGES: Final[dict[str, tuple[float, float]]] = {
     "loop_place": (1e-6, 10.0),
     "loop_heading": (1e-6, 10.0),
     "robust": (1e-3, 1e6),
+    "doubt": (0.1, 10.0),
     "compass_wall": (1e-4, 10.0),
 }
 ODOMETER: Final = "odometer_"

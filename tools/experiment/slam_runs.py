@@ -46,6 +46,7 @@ SMALL_TURN: Final = 0.3
 RIGHT: Final = 0.1
 """m between two whisks of a loop that is right."""
 MEMORY: Final = SequenceConfig().memory
+DOUBT: Final = SequenceConfig().doubt
 LAGS: Final = {"batch": BATCH, "lag 100": 100, "lag 30": 30, "lag 10": 10, "past only": 0}
 NOISES: Final = ("jit", "third", "full")
 MAZES: Final = {"A": (0.75, 0.6), "B": (0.4, 0.5)}
@@ -56,7 +57,7 @@ FIRST_SEED: Final = 800
 @dataclass(frozen=True)
 class SlamRow:
     """A row of the table: `kind` is sequence, ratslam or path; image and control as in MapCase;
-    lag, compass and memory as in SequenceConfig."""
+    lag, compass, memory and doubt as in SequenceConfig."""
 
     name: str
     kind: str
@@ -65,6 +66,7 @@ class SlamRow:
     control: str = "none"
     compass: bool = False
     memory: int = MEMORY
+    doubt: float = DOUBT
 
 
 COMPASS: Final = (
@@ -81,6 +83,9 @@ ROWS: Final = (
     SlamRow("sequence, batch, blind", "sequence", control="blind"),
     SlamRow("sequence, batch, shuffled", "sequence", control="shuffled"),
     SlamRow("sequence, lag 100, shuffled", "sequence", lag=100, control="shuffled"),
+    SlamRow("sequence, batch, doubt 1 rad", "sequence", doubt=1.0),
+    SlamRow("sequence, lag 100, doubt 1 rad", "sequence", lag=100, doubt=1.0),
+    SlamRow("sequence, batch, doubt 1 rad, shuffled", "sequence", control="shuffled", doubt=1.0),
     *COMPASS,
     SlamRow("RatSLAM, contact angle", "ratslam"),
     SlamRow("RatSLAM, contact angle, blind", "ratslam", control="blind"),
@@ -256,7 +261,13 @@ def sequence_map(
     recording: Recording, motion: Floats, row: SlamRow, noise: OdometerNoise, seed: int
 ) -> tuple[Floats, NDArray[np.int64]]:
     """The whisks' poses float64[n, 3] in the final map, and its loops int64[m, 2]."""
-    config = SequenceConfig(lag=row.lag, compass=row.compass, memory=row.memory, odometer=noise)
+    config = SequenceConfig(
+        lag=row.lag,
+        compass=row.compass,
+        memory=row.memory,
+        doubt=row.doubt,
+        odometer=noise,
+    )
     slam = SequenceSlam(config, head_shape())
     for image, (v, w, dt) in zip(_images(recording, row, seed), motion.tolist(), strict=True):
         slam.step(image, Odometry(v, w, dt))
