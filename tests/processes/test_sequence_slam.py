@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -34,8 +35,20 @@ CRANK = """\
 """
 
 
-def made(folder: Path, slam: str, swaps: str = "", duration: float = 9.0) -> Experiment:
-    (folder / "corners.maze").write_text(CORNERS)
+takes_minutes = pytest.mark.skipif(
+    not os.environ.get("VIBRISSA_ALL_TESTS"), reason="takes minutes: VIBRISSA_ALL_TESTS=1"
+)
+
+
+def made(
+    folder: Path,
+    slam: str,
+    swaps: str = "",
+    duration: float = 9.0,
+    maze: str = CORNERS,
+    sequence: str = "CCCCCC",
+) -> Experiment:
+    (folder / "corners.maze").write_text(maze)
     path = folder / "experiment.toml"
     path.write_text(
         f"""\
@@ -49,7 +62,7 @@ calibration_cycles = 1
 [arm]
 speed = 0.25
 lift = 0.05
-sequence = "CCCCCC"
+sequence = "{sequence}"
 [slam]
 {"" if "image =" in slam else 'image = "contact_angle"'}
 {slam}
@@ -96,19 +109,23 @@ def test_as_the_runs_first_slam_it_maps_every_whisk_and_the_log_re_runs(tmp_path
     assert verdict.identical, verdict.first_difference
 
 
+@takes_minutes
 def test_loops_that_were_closed_in_a_run_are_closed_again_to_the_byte(tmp_path: Path) -> None:
-    parameters = "parameters = { lag = 10, gap = 6, evidence = 0.5, compass = true }"
+    slam = (
+        'algorithm = "sequence"\nodometry_noise = "third"\nparameters = { lag = 2, gap = 3,'
+        " evidence = 2.0, certain = 0.6, enter = 0.02, leave = 0.02, gate = 8.0 }"
+    )
     out = tmp_path / "run"
-    slam = f'algorithm = "sequence"\n{parameters}\nodometry_noise = "third"'
-    assert simulate(made(tmp_path, slam, duration=34.0), out)["cause"] == "completed"
+    experiment = made(tmp_path, slam, duration=31.0, maze=CRANK, sequence="CACA")
+    assert simulate(experiment, out)["cause"] == "completed"
     last = said(out, "slam.map")["slam"][-1]
     loops = last.links[len(last.poses) - 1 :]
-    assert len(loops) >= 5
     poses = said(out, "slam.pose")["slam"]
     place = np.array([pose.truth[:2] for pose in poses])
     apart = np.hypot(*(place[loops[:, 0]] - place[loops[:, 1]]).T)
-    assert np.median(apart) < 0.1, "loops join whisks at one place"
-    assert min(pose.experience - k for k, pose in enumerate(poses)) < 0, "recognised on the way"
+    assert len(loops) >= 3 and np.median(apart) < 0.1, "loops join whisks at one place"
+    known = [pose.experience < k for k, pose in enumerate(poses)]
+    assert any(known), "places were recognised on the way"
     for executor in ("fused", "lockstep"):
         verdict = verify(out / "run.mcap", executor)
         assert verdict.identical, verdict.first_difference
