@@ -27,7 +27,7 @@ def calibrate(
     ] = 4,
     circuits: Annotated[
         int, typer.Option(min=1, max=100, help="odometry: circuits to drive, there and back.")
-    ] = 4,
+    ] = 2,
     out: Annotated[
         Path | None,
         typer.Option(help="New file. Default: calibration-HEAD-DATE.json, odometer-DATE.json."),
