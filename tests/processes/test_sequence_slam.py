@@ -113,10 +113,10 @@ def test_as_the_runs_first_slam_it_maps_every_whisk_and_the_log_re_runs(tmp_path
 def test_loops_that_were_closed_in_a_run_are_closed_again_to_the_byte(tmp_path: Path) -> None:
     slam = (
         'algorithm = "sequence"\nodometry_noise = "third"\nparameters = { lag = 2, gap = 3,'
-        " evidence = 2.0, certain = 0.6, enter = 0.02, leave = 0.02, gate = 8.0 }"
+        " evidence = 1.0, certain = 0.6, enter = 0.02, leave = 0.02, gate = 8.0 }"
     )
     out = tmp_path / "run"
-    experiment = made(tmp_path, slam, duration=31.0, maze=CRANK, sequence="CACA")
+    experiment = made(tmp_path, slam, duration=35.5, maze=CRANK, sequence="CACA")
     assert simulate(experiment, out)["cause"] == "completed"
     last = said(out, "slam.map")["slam"][-1]
     loops = last.links[len(last.poses) - 1 :]
