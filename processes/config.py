@@ -168,6 +168,12 @@ class Slam(Section):
         dict[str, float | int | bool], Field(description="over the preset; sequence: docs/slam.md")
     ] = {}
     odometry_noise: Annotated[str, Field(description="named odometry noise model")] = "none"
+    odometer: Annotated[
+        str, Field(description="file of vibrissa calibrate odometry, for the sequence SLAM")
+    ] = ""
+    odometer_text: Annotated[
+        str, Field(description="the file's content; filled in when it is read")
+    ] = ""
 
 
 class Swap(Section):
@@ -298,17 +304,26 @@ def load_experiment(
             raise RunError(f"{where}: {error}") from None
         maze = experiment.maze.model_copy(update={"text": text})
         experiment = experiment.model_copy(update={"maze": maze})
-    named = experiment.whisk.calibration
-    if named and not experiment.whisk.calibration_text:
-        try:
-            learnt = ((path.parent if path else Path()) / named).read_text()
-        except (OSError, UnicodeDecodeError) as error:
-            why = getattr(error, "strerror", None) or error
-            raise RunError(f"{where}: whisk.calibration {named!r}: {why}") from None
-        whisk = experiment.whisk.model_copy(update={"calibration_text": learnt})
-        experiment = experiment.model_copy(update={"whisk": whisk})
+    for section, key in (("whisk", "calibration"), ("slam", "odometer")):
+        experiment = _with_text(experiment, section, key, path, where)
     _check_parts(experiment, where)
     return experiment
+
+
+def _with_text(
+    experiment: Experiment, section: str, key: str, path: Path | None, where: str
+) -> Experiment:
+    """The experiment with the content of the file that a key names. Raises RunError."""
+    table: Section = getattr(experiment, section)
+    named = getattr(table, key)
+    if not named or getattr(table, f"{key}_text"):
+        return experiment
+    try:
+        text = ((path.parent if path else Path()) / named).read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise RunError(f"{where}: {section}.{key} {named!r}: {why}") from None
+    return experiment.model_copy(update={section: table.model_copy(update={f"{key}_text": text})})
 
 
 def _check_parts(experiment: Experiment, where: str) -> None:

@@ -13,18 +13,23 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
+from vibrissa.control.kinematics import NOSE_HEIGHT, paper_head
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.controllers import imported
+from vibrissa.processes.odometer_file import from_text
 from vibrissa.processes.results import RunError
+from vibrissa.slam.compass import HeadShape
 from vibrissa.slam.config import PRESETS, ConfigError, RatSlamConfig
 from vibrissa.slam.interface import Slam
 from vibrissa.slam.odometry import NOISE_MODELS
 from vibrissa.slam.ratslam import RatSlam
 from vibrissa.slam.sequence import SequenceSlam
-from vibrissa.slam.sequence_config import SequenceConfig, sequence_config
+from vibrissa.slam.sequence_config import ODOMETER, SequenceConfig, sequence_config
 from vibrissa.slam.sequence_rehearsal import rehearse
 
 ENTRY_POINTS: Final = "vibrissa.slams"
+COMPASS_IMAGE: Final = "contact_angle"
+"""The image that tells where a tip was when it touched."""
 
 
 def make_slam_config(
@@ -58,11 +63,27 @@ def make_slam_config(
 def make_sequence_config(
     experiment: Experiment, parameters: Mapping[str, Any] | None = None
 ) -> SequenceConfig:
-    """The sequence SLAM's parameters of an experiment, others over them. Raises RunError."""
+    """The sequence SLAM's parameters of an experiment, others over them. Raises RunError.
+
+    What an odometer file says holds for every SLAM of the run; parameters go before it.
+    """
+    own = _odometer(experiment) | _section(experiment, "sequence")
     try:
-        return sequence_config(_section(experiment, "sequence") | dict(parameters or {}))
+        made = sequence_config(own | dict(parameters or {}))
     except ValueError as error:
         raise RunError(f"slam.parameters.{error}") from None
+    if made.compass and experiment.slam.image != COMPASS_IMAGE:
+        raise RunError(
+            f"slam.parameters.compass: expected slam.image {COMPASS_IMAGE!r} with it,"
+            f" found {experiment.slam.image!r}"
+        )
+    return made
+
+
+def head_shape() -> HeadShape:
+    """Where the whiskers of the head are while it travels."""
+    head = paper_head()
+    return HeadShape(head.pivot_height + NOSE_HEIGHT, head.pivot_radius, head.length, head.azimuth)
 
 
 def _section(experiment: Experiment, name: str) -> dict[str, Any]:
@@ -70,6 +91,20 @@ def _section(experiment: Experiment, name: str) -> dict[str, Any]:
     to RatSLAM else."""
     meant = "sequence" if experiment.slam.algorithm == "sequence" else "ratslam"
     return dict(experiment.slam.parameters) if name == meant else {}
+
+
+def _odometer(experiment: Experiment) -> dict[str, Any]:
+    """What the odometer file of an experiment says, as parameters. Raises RunError."""
+    settings = experiment.slam
+    if not settings.odometer_text:
+        return {}
+    noise, model = from_text(settings.odometer_text, f"slam.odometer {settings.odometer}")
+    if model != settings.odometry_noise:
+        raise RunError(
+            f"slam.odometer {settings.odometer} is of odometry_noise {model!r},"
+            f" slam.odometry_noise is {settings.odometry_noise!r}"
+        )
+    return {ODOMETER + name: value for name, value in dataclasses.asdict(noise).items()}
 
 
 def check(experiment: Experiment) -> None:
@@ -83,7 +118,7 @@ def _ratslam(experiment: Experiment, parameters: dict[str, Any]) -> Slam:
 
 
 def _sequence(experiment: Experiment, parameters: dict[str, Any]) -> Slam:
-    return SequenceSlam(make_sequence_config(experiment, parameters))
+    return SequenceSlam(make_sequence_config(experiment, parameters), head_shape())
 
 
 BUILT_IN: Final[dict[str, Callable[[Experiment, dict[str, Any]], Slam]]] = {

@@ -127,6 +127,26 @@ def _newton(
     params: GraphParams,
     weights: Floats,
 ) -> Floats:
+    diagonal, lower, gradient = normal_equations(graph, structure, slots, poses, params, weights)
+    if not factorise(structure.start, structure.row, diagonal, lower):
+        raise ArithmeticError("pose graph: the normal equations are not positive definite")
+    solve(structure.place, structure.start, structure.row, diagonal, lower, gradient)
+    return gradient
+
+
+def normal_equations(
+    graph: Graph,
+    structure: Structure,
+    slots: Ints,
+    poses: Floats,
+    params: GraphParams,
+    weights: Floats,
+) -> tuple[Floats, Floats, Floats]:
+    """The blocks of A and the right-hand side of A step = b at these poses and loop weights.
+
+    diagonal float64[n, 3, 3], lower float64[l, 3, 3] as `factorise` takes them, in order of
+    elimination; b float64[n, 3] in order of nodes.
+    """
     nodes = len(poses)
     diagonal = np.zeros((nodes, 3, 3))
     lower = np.zeros((len(structure.row), 3, 3))
@@ -148,10 +168,7 @@ def _newton(
         lower,
         gradient,
     )
-    if not factorise(structure.start, structure.row, diagonal, lower):
-        raise ArithmeticError("pose graph: the normal equations are not positive definite")
-    solve(structure.place, structure.start, structure.row, diagonal, lower, gradient)
-    return gradient
+    return diagonal, lower, gradient
 
 
 @compiled

@@ -15,26 +15,30 @@ from numpy.typing import NDArray
 from vibrissa.slam.graph import Floats, Graph, GraphParams, Ints, Solution, optimise
 from vibrissa.slam.graph_start import start_values
 
-DOUBT: Final = 2.0
-"""Surprise of a loop's heading beyond which its whole turns are in doubt, rad."""
 MOST_DOUBTS: Final = 6
 """Loops whose whole turns are tried the other way, each at the price of one optimisation."""
 
 
 def solve_unwound(
-    first: Floats, steps: Floats, loops: Ints, facing: NDArray[np.int8], params: GraphParams
+    first: Floats,
+    steps: Floats,
+    loops: Ints,
+    facing: NDArray[np.int8],
+    params: GraphParams,
+    doubt: float,
 ) -> Solution:
     """The best poses found over the whole turns in doubt.
 
     first float64[3]: pose of node 0; steps float64[n - 1, 4], loops int64[m, 2] in ascending order
-    of their later node, facing int8[m], as in `start_values`.
+    of their later node, facing int8[m], as in `start_values`; doubt: rad, surprise of a loop's
+    heading beyond which its whole turns are tried the other way too.
     """
     other = np.zeros(len(loops), dtype=np.bool_)
     best, surprise = _solve(first, steps, loops, facing, params, other)
     tried = 0
     done = -1
     while tried < MOST_DOUBTS:
-        later = np.flatnonzero(np.abs(surprise[done + 1 :]) > DOUBT)
+        later = np.flatnonzero(np.abs(surprise[done + 1 :]) > doubt)
         if len(later) == 0:
             break
         done += 1 + int(later[0])

@@ -13,6 +13,11 @@ from vibrissa.slam.interface import SlamInputError
 
 LEAST_STEPS: Final = 8
 """Steps of a calibration segment below which its scatter says nothing."""
+STILL: Final = 0.05
+"""Share of the largest motion below which there is none."""
+LEAST_WAY: Final = 1e-4
+LEAST_TURN: Final = 1e-3
+"""m and rad per step below which nothing moved."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,13 +71,54 @@ def calibrated(straight: ArrayLike, turn: ArrayLike) -> OdometerNoise:
         raise SlamInputError("odometer straight: expected some way per step, found 0 m")
     if turn_mean[1] == 0.0:
         raise SlamInputError("odometer turn: expected some turn per step, found 0 rad")
-    distance_var = max(straight_var[0] - turn_var[0], 0.0)
-    angle_var = max(turn_var[1] - straight_var[1], 0.0)
+    return _noise(straight_var, abs(float(straight_mean[0])), turn_var, abs(float(turn_mean[1])))
+
+
+def calibrated_against(felt: ArrayLike, true: ArrayLike) -> tuple[OdometerNoise, int, int]:
+    """The noise of an odometer whose steps are known, and how many were on a straight and a turn.
+
+    felt, true: float64[n, 2], distance (m) and turn (rad) of every step, as the odometer says and
+    as they were. Steps straight ahead and steps on the spot are picked by what they were; the
+    others say nothing. Errors count from the truth, so that a steady error is noise as well.
+    Raises SlamInputError for numbers that are not finite and fewer than 8 steps of a kind.
+    """
+    said, was = np.asarray(felt, dtype=np.float64), np.asarray(true, dtype=np.float64)
+    if said.ndim != 2 or said.shape[1:] != (2,) or was.shape != said.shape:
+        raise SlamInputError(
+            f"odometer: expected float64[n, 2] twice, found shapes {said.shape} and {was.shape}"
+        )
+    if not (np.isfinite(said).all() and np.isfinite(was).all()):
+        raise SlamInputError("odometer: expected finite numbers, found NaN or infinity")
+    way, turn = np.abs(was).T
+    longest, widest = way.max(initial=LEAST_WAY), turn.max(initial=LEAST_TURN)
+    straights = (turn <= STILL * widest) & (way >= 0.5 * longest)
+    turns = (way <= STILL * longest) & (turn >= 0.5 * widest)
+    for kind, chosen in (("straight ahead", straights), ("turning in place", turns)):
+        if (count := int(chosen.sum())) < LEAST_STEPS:
+            raise SlamInputError(
+                f"odometer: expected at least {LEAST_STEPS} whisks {kind}, found {count}"
+            )
+    error = np.square(said - was)
+    found = _noise(
+        error[straights].mean(axis=0),
+        math.sqrt(float(np.square(way[straights]).mean())),
+        error[turns].mean(axis=0),
+        math.sqrt(float(np.square(turn[turns]).mean())),
+    )
+    return found, int(straights.sum()), int(turns.sum())
+
+
+def _noise(
+    straight: NDArray[np.float64], way: float, turn: NDArray[np.float64], angle: float
+) -> OdometerNoise:
+    """From variances (distance, turn) of steps of `way` m straight ahead, `angle` rad in place."""
+    distance_var = max(straight[0] - turn[0], 0.0)
+    angle_var = max(turn[1] - straight[1], 0.0)
     return OdometerNoise(
-        distance=max(math.sqrt(turn_var[0]), FLOOR.distance),
-        distance_share=math.sqrt(distance_var) / abs(float(straight_mean[0])),
-        turn=max(math.sqrt(straight_var[1]), FLOOR.turn),
-        turn_share=math.sqrt(angle_var) / abs(float(turn_mean[1])),
+        distance=max(math.sqrt(turn[0]), FLOOR.distance),
+        distance_share=math.sqrt(distance_var) / way,
+        turn=max(math.sqrt(straight[1]), FLOOR.turn),
+        turn_share=math.sqrt(angle_var) / angle,
     )
 
 

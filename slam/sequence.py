@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.slam.angles import wrap_pi
+from vibrissa.slam.compass import Compass, HeadShape
+from vibrissa.slam.config import ConfigError
 from vibrissa.slam.graph import GraphParams
 from vibrissa.slam.graph_start import reckon
 from vibrissa.slam.graph_winding import solve_unwound
@@ -80,13 +82,18 @@ class Loops:
 class SequenceSlam:
     """The sequence SLAM behind the `Slam` interface; see `SequenceConfig`.
 
+    head: where its whiskers are, for the compass alone. Raises ConfigError for a compass without.
+
     An experience is a whisk, its id the number of the whisk; a place seen again has that of the
     first. A template is a contact mask. `SlamMap.links` are the odometry steps and the loops.
     There are no pose cells: pc_x, pc_y, pc_th are 0.
     """
 
-    def __init__(self, config: SequenceConfig) -> None:
+    def __init__(self, config: SequenceConfig, head: HeadShape | None = None) -> None:
+        if config.compass and head is None:
+            raise ConfigError("compass: expected the shape of the head with it")
         self.config = config
+        self._compass = Compass(head, config.compass_wall) if config.compass and head else None
         self._graph = GraphParams(
             config.lateral, config.loop_place, config.loop_heading, config.robust
         )
@@ -97,6 +104,7 @@ class SequenceSlam:
         self._at_once = max(1, min(config.decide_every, config.lag // 4))
         self._poses = np.zeros((256, 3))
         self._steps = np.zeros((256, 4))
+        self._by_wall = np.zeros(256, dtype=np.bool_)
         self._reckoning = Reckoning()
         self._trust = Trust()
         self._loops = Loops(
@@ -122,7 +130,7 @@ class SequenceSlam:
         self._map = None
         whisk = self._memory.count
         new_template = self._memory.feel(mask)
-        self._append(whisk, distance, turn)
+        self._append(whisk, image, distance, turn)
         match = self._recognise(whisk, mask)
         known = match >= 0
         pose = self._poses[whisk]
@@ -173,14 +181,19 @@ class SequenceSlam:
         m = self._loops.count
         return np.concatenate([self._loops.ends[:m], self._loops.facing[:m, None]], axis=1)
 
-    def _append(self, whisk: int, distance: float, turn: float) -> None:
+    def _append(self, whisk: int, image: NDArray[np.uint8], distance: float, turn: float) -> None:
         self._poses = grown(self._poses, whisk + 1)
         self._steps = grown(self._steps, whisk + 1)
         self._poses[whisk] = self._poses[whisk - 1] if whisk else 0.0
-        reckon(self._poses[whisk], distance, turn)
-        sigmas = self.config.odometer.sigmas(distance, turn)
-        self._steps[whisk] = distance, turn, *sigmas
-        self._reckoning.add(whisk, self._steps[whisk])
+        step = self._steps[whisk]
+        step[:] = distance, turn, *self.config.odometer.sigmas(distance, turn)
+        self._reckoning.add(whisk, step)
+        self._by_wall = grown(self._by_wall, whisk + 1)
+        if self._compass:
+            sigma = float(step[3])
+            step[1], step[3] = self._compass.turned(image, turn, sigma)
+            self._by_wall[whisk] = step[3] < sigma
+        reckon(self._poses[whisk], distance, float(step[1]))
         loops = self._loops
         loops.label = grown(loops.label, whisk + 1)
         loops.label[whisk] = whisk
@@ -257,7 +270,16 @@ class SequenceSlam:
             belief.new = max(1.0 - float(known.sum()), 0.0)
             belief.known = known
 
-    def _solved(self) -> SlamMap:
+    def pose_graph(self) -> tuple[Floats, Ints, NDArray[np.int8]]:
+        """What the map of at least one whisk is solved from, every whisk decided: steps
+        float64[n - 1, 4], loops int64[m, 2] and facing int8[m] as in `graph_start.start_values`."""
+        loops = self._all_loops()
+        ends, facing = self._ordered(loops)
+        trust = self._trust.copied()
+        trust.look_at(ends, facing, self._reckoning.travelled)
+        return self._trusted(trust, 0), ends, facing
+
+    def _all_loops(self) -> Loops:
         n = self._memory.count
         loops = self._loops.copied()
         if self.config.lag == BATCH:
@@ -270,16 +292,20 @@ class SequenceSlam:
                 found = self._find(first + k, posterior, loops)
                 if len(found):
                     loops.add(first + k, found, self._memory.whisk)
-        poses = np.zeros((0, 3))
-        ends, facing = self._ordered(loops)
-        if n:
-            trust = self._trust.copied()
-            trust.look_at(ends, facing, self._reckoning.travelled)
-            steps = self._trusted(trust, 0)
-            poses = solve_unwound(self._poses[0], steps, ends, facing, self._graph).poses
+        return loops
+
+    def _solved(self) -> SlamMap:
+        n = self._memory.count
+        if n == 0:
+            none = np.zeros((0, 2), dtype=np.int32)
+            return SlamMap(np.zeros((0, 3)), none, self._memory.kind_of.copy())
+        steps, ends, facing = self.pose_graph()
+        poses = solve_unwound(
+            self._poses[0], steps, ends, facing, self._graph, self.config.doubt
+        ).poses
         for pose in poses:
             pose[2] = wrap_pi(float(pose[2]))
-        chain = np.stack([np.arange(n - 1), np.arange(1, n)], axis=1) if n else ends
+        chain = np.stack([np.arange(n - 1), np.arange(1, n)], axis=1)
         links = np.concatenate([chain, ends]).astype(np.int32)
         return SlamMap(poses, links, self._memory.kind_of.copy())
 
@@ -301,7 +327,9 @@ class SequenceSlam:
         factors = trust.factors
         if (factors < 1.0).any():
             steps = steps.copy()
-            steps[first:, 2:] *= factors
+            steps[first:, 2] *= factors[0]
+            by_odometry_alone = ~self._by_wall[first + 1 : self._memory.count]
+            steps[first:, 3][by_odometry_alone] *= factors[1]
         return steps
 
     @staticmethod

@@ -40,6 +40,11 @@ class SequenceConfig:
     lateral: m, standard deviation of sideways motion per whisk.
     loop_place, loop_heading: m and rad, standard deviation of a loop.
     robust: chi^2 (3 degrees of freedom) at which a loop's pull is a quarter.
+    doubt: rad, by how much the heading of a loop must surprise for its whole turns to be tried the
+        other way too when the map is solved.
+    compass: correct the turn of every step by the walls that are touched (see compass); the image
+        has to be that of contact angles.
+    compass_wall: rad, standard deviation of a wall's direction.
     odometer: what a step of odometry is worth.
 
     Raises ConfigError on construction when a value is out of range.
@@ -64,14 +69,19 @@ class SequenceConfig:
     loop_place: float = 0.015
     loop_heading: float = 0.1
     robust: float = 9.0
+    doubt: float = 2.0
+    compass: bool = False
+    compass_wall: float = 0.01
     odometer: OdometerNoise = field(default_factory=OdometerNoise)
 
     def __post_init__(self) -> None:
         for parameter in fields(self):
             name = parameter.name
-            if name == "odometer":
-                continue
             value: Any = getattr(self, name)
+            if name == "compass" and not isinstance(value, bool):
+                raise ConfigError(f"{name}: expected true or false, found {value!r}")
+            if name in ("compass", "odometer"):
+                continue
             whole = str(parameter.type) == "int"
             if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)):
                 raise ConfigError(f"{name}: expected {parameter.type}, found {value!r}")
@@ -112,6 +122,8 @@ _RANGES: Final[dict[str, tuple[float, float]]] = {
     "loop_place": (1e-6, 10.0),
     "loop_heading": (1e-6, 10.0),
     "robust": (1e-3, 1e6),
+    "doubt": (0.1, 10.0),
+    "compass_wall": (1e-4, 10.0),
 }
 ODOMETER: Final = "odometer_"
 """Prefix of the fields of `odometer` where parameters are plain names and numbers."""

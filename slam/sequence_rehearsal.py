@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from vibrissa.numerics import philox_uniform
+from vibrissa.slam.compass import HeadShape
 from vibrissa.slam.interface import Odometry
 from vibrissa.slam.sequence import SequenceSlam
 from vibrissa.slam.sequence_config import BATCH, SequenceConfig
@@ -22,8 +23,9 @@ TOUCHED: Final = 0.4
 def rehearse() -> int:
     """Drive laps of a track whose places feel different, online and in batch; loops it found."""
     found = 0
+    shape = HeadShape(*np.ones((4, WHISKERS)))
     for lag in (BATCH, 20):
-        slam = SequenceSlam(SequenceConfig(lag=lag, memory=96))
+        slam = SequenceSlam(SequenceConfig(lag=lag, memory=96, compass=lag != BATCH), shape)
         for whisk in range(LAPS * PLACES):
             first = WHISKERS * (whisk % PLACES // 3)
             draws = [philox_uniform(0, STREAM, first + k) for k in range(WHISKERS)]

@@ -1,13 +1,15 @@
 """`vibrissa bench touch`: does touch alone beat its own odometry, on a small sample.
 
 Few runs of `vibrissa experiment slam`: batch and lag 100, blind and shuffled beside them. Floor is
-the run's own dead reckoning, ratio 1.
+the run's own dead reckoning, ratio 1. Then what it costs: by length of run, memory and lag, and the
+graph's solver beside SciPy's.
 """
 
 from __future__ import annotations
 
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,6 +20,7 @@ from vibrissa.slam.interface import Odometry
 from vibrissa.slam.sequence import SequenceSlam
 from vibrissa.slam.sequence_config import SequenceConfig
 from vibrissa.tools.bench import Bench, Target
+from vibrissa.tools.bench_touch_cost import by_length, by_setting, by_solver, settings
 from vibrissa.tools.experiment.design import CONTACT_ANGLE
 from vibrissa.tools.experiment.mapping import noisy
 from vibrissa.tools.experiment.recording import Recording
@@ -27,6 +30,8 @@ from vibrissa.tools.experiment.slam_runs import ROWS, odometer, run_row, works
 from vibrissa.tools.experiment.tasks import recorded
 
 SEEDS: Final = 2
+COSTED: Final = "third"
+"""Odometry noise under which costs are measured."""
 TOUCH: Final = ("sequence, batch", "sequence, lag 100")
 CONTROLS: Final = (
     "sequence, batch, blind",
@@ -38,12 +43,14 @@ CONTROLS: Final = (
 def bench(out: Path, seconds: float, on_progress: OnProgress, *, quick: bool = False) -> Bench:
     """Two seeds in two mazes each under three odometry noises; `seconds` is not looked at.
 
-    quick: one short data set, to see that it works.
+    quick: one short data set without costs by size, to see that it works.
     """
     wanted = [work for work in works(SEEDS, quick) if work.group == "plain"]
     wanted = wanted[:1] if quick else wanted
     rows = [row for row in ROWS if row.name in (*TOUCH, *CONTROLS)]
     runs: list[dict[str, Any]] = []
+    costs: list[dict[str, Any]] = []
+    aims: list[Target] = []
     with tempfile.TemporaryDirectory() as cache:
         for done, work in enumerate(wanted):
             on_progress(Progress(work.noise, float(done), float(len(wanted))))
@@ -54,6 +61,11 @@ def bench(out: Path, seconds: float, on_progress: OnProgress, *, quick: bool = F
                 labels | run_row(recording, motion, row, work.noise, work.rig.seed) for row in rows
             ]
         cost = milliseconds(recording, work.noise, work.rig.seed)
+        if not quick:
+            on_progress(Progress("costs", 0.0, 0.0))
+            costs, aims = measured(
+                [(recorded(Path(cache), w.rig), w.rig.seed) for w in wanted if w.noise == COSTED]
+            )
     table = tabulate(runs)
     targets = []
     for name in TOUCH:
@@ -68,7 +80,23 @@ def bench(out: Path, seconds: float, on_progress: OnProgress, *, quick: bool = F
         | {f"{r} {part}": cell[r][part] for r in RELATIONS for part in ("ratio", "worst", "wins")}
         for cell in table
     ]
-    return Bench("touch", flat, targets)
+    return Bench("touch", [*flat, *costs], targets + aims)
+
+
+def measured(
+    recordings: Sequence[tuple[Recording, int]],
+) -> tuple[list[dict[str, Any]], list[Target]]:
+    """The tables of costs over recordings (with their seeds), and what they should be."""
+    recording, seed = recordings[0]
+    lengths = by_length(recording, COSTED, seed)
+    solvers = by_solver(recording, COSTED, seed)
+    longest = lengths[-1]
+    aims = [
+        Target(f"{longest['whisks']} whisks, p99 of a whisk", longest["p99, ms"], "ms", "<=", 50),
+        Target("solver against SciPy's, poses apart", solvers[1]["apart"], "m, rad", "<=", 1e-9),
+        Target("SciPy's solver over the compiled one", solvers[1]["ratio"], "x", ">=", 1),
+    ]
+    return [*lengths, *solvers, *by_setting(recordings, COSTED, settings())], aims
 
 
 def milliseconds(recording: Recording, noise: str, seed: int) -> float:

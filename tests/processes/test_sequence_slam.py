@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.processes.test_swap_between_cycles import said
@@ -24,13 +26,34 @@ CORNERS = """\
 """
 
 
-def made(folder: Path, slam: str, swaps: str = "") -> Experiment:
-    (folder / "corners.maze").write_text(CORNERS)
+CRANK = """\
++---+---+---+
+|   |       |
++   +---+   +
+|       |   |
++---+---+---+
+"""
+
+
+takes_minutes = pytest.mark.skipif(
+    not os.environ.get("VIBRISSA_ALL_TESTS"), reason="takes minutes: VIBRISSA_ALL_TESTS=1"
+)
+
+
+def made(
+    folder: Path,
+    slam: str,
+    swaps: str = "",
+    duration: float = 9.0,
+    maze: str = CORNERS,
+    sequence: str = "CCCCCC",
+) -> Experiment:
+    (folder / "corners.maze").write_text(maze)
     path = folder / "experiment.toml"
     path.write_text(
         f"""\
 [run]
-duration = 9
+duration = {duration}
 [maze]
 file = "corners.maze"
 [whisk]
@@ -39,9 +62,9 @@ calibration_cycles = 1
 [arm]
 speed = 0.25
 lift = 0.05
-sequence = "CCCCCC"
+sequence = "{sequence}"
 [slam]
-image = "contact_angle"
+{"" if "image =" in slam else 'image = "contact_angle"'}
 {slam}
 {swaps}
 """
@@ -86,6 +109,28 @@ def test_as_the_runs_first_slam_it_maps_every_whisk_and_the_log_re_runs(tmp_path
     assert verdict.identical, verdict.first_difference
 
 
+@takes_minutes
+def test_loops_that_were_closed_in_a_run_are_closed_again_to_the_byte(tmp_path: Path) -> None:
+    slam = (
+        'algorithm = "sequence"\nodometry_noise = "third"\nparameters = { lag = 2, gap = 3,'
+        " evidence = 1.0, certain = 0.6, enter = 0.02, leave = 0.02, gate = 8.0 }"
+    )
+    out = tmp_path / "run"
+    experiment = made(tmp_path, slam, duration=35.5, maze=CRANK, sequence="CACA")
+    assert simulate(experiment, out)["cause"] == "completed"
+    last = said(out, "slam.map")["slam"][-1]
+    loops = last.links[len(last.poses) - 1 :]
+    poses = said(out, "slam.pose")["slam"]
+    place = np.array([pose.truth[:2] for pose in poses])
+    apart = np.hypot(*(place[loops[:, 0]] - place[loops[:, 1]]).T)
+    assert len(loops) >= 3 and np.median(apart) < 0.1, "loops join whisks at one place"
+    known = [pose.experience < k for k, pose in enumerate(poses)]
+    assert any(known), "places were recognised on the way"
+    for executor in ("fused", "lockstep"):
+        verdict = verify(out / "run.mcap", executor)
+        assert verdict.identical, verdict.first_difference
+
+
 @pytest.mark.parametrize(
     ("slam", "words"),
     [
@@ -101,6 +146,10 @@ def test_as_the_runs_first_slam_it_maps_every_whisk_and_the_log_re_runs(tmp_path
         (
             'algorithm = "sequence"\nparameters = { odometer_turn = 0.0 }',
             "slam.parameters.odometer_turn: expected a finite number > 0, found 0.0",
+        ),
+        (
+            'image = "max_angle_gated"\nalgorithm = "sequence"\nparameters = { compass = true }',
+            "slam.parameters.compass: expected slam.image 'contact_angle' with it",
         ),
         ('algorithm = "cartographer"', "'cartographer': expected one of ratslam, sequence"),
     ],

@@ -20,6 +20,7 @@ from vibrissa.tools.console import note, write_json
 from vibrissa.tools.experiment.mapping import noisy
 from vibrissa.tools.experiment.report import STYLE, grid, number, picture
 from vibrissa.tools.experiment.scores import RELATIONS, dead_reckoning
+from vibrissa.tools.experiment.slam_markdown import markdown
 from vibrissa.tools.experiment.slam_runs import (
     NOISES,
     ROWS,
@@ -41,7 +42,7 @@ SHOWN: Final = ("sequence, batch", "sequence, lag 100", "sequence, past only")
 
 
 def run_slam(seeds: int, quick: bool, jobs: int, out: Path) -> dict[str, Any]:
-    """Run what the cache lacks, write results.json and report.html into `out`; the results."""
+    """Run what the cache lacks, write results.json, report.md and report.html into `out`."""
     folder = out / "cache"
     folder.mkdir(parents=True, exist_ok=True)
     wanted = works(seeds, quick)
@@ -51,6 +52,7 @@ def run_slam(seeds: int, quick: bool, jobs: int, out: Path) -> dict[str, Any]:
     results = {"table": table, "runs": runs, "machine": machine(), "seeds": seeds}
     write_json(out / "results.json", results)
     drawn = [front(table), *(maps(folder, work) for work in wanted[: len(NOISES)])]
+    (out / "report.md").write_text(markdown(table))
     (out / "report.html").write_text(page(results, drawn))
     return results
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vibrissa.numerics import philox_normal, philox_uniform
+from vibrissa.processes.slams import head_shape
 from vibrissa.rig.maze import format_maze
 from vibrissa.rig.maze_random import random_maze
 from vibrissa.slam.config import PRESETS
@@ -44,6 +45,8 @@ SMALL_TURN: Final = 0.3
 """Turn per step below which the path assumption takes it for none, rad."""
 RIGHT: Final = 0.1
 """m between two whisks of a loop that is right."""
+MEMORY: Final = SequenceConfig().memory
+DOUBT: Final = SequenceConfig().doubt
 LAGS: Final = {"batch": BATCH, "lag 100": 100, "lag 30": 30, "lag 10": 10, "past only": 0}
 NOISES: Final = ("jit", "third", "full")
 MAZES: Final = {"A": (0.75, 0.6), "B": (0.4, 0.5)}
@@ -53,21 +56,37 @@ FIRST_SEED: Final = 800
 
 @dataclass(frozen=True)
 class SlamRow:
-    """A row of the table: `kind` is sequence, ratslam or path; image and control as in MapCase."""
+    """A row of the table: `kind` is sequence, ratslam or path; image and control as in MapCase;
+    lag, compass, memory and doubt as in SequenceConfig."""
 
     name: str
     kind: str
     image: str = CONTACT_ANGLE
     lag: int = BATCH
     control: str = "none"
+    compass: bool = False
+    memory: int = MEMORY
+    doubt: float = DOUBT
 
 
+COMPASS: Final = (
+    SlamRow("sequence + compass, batch", "sequence", compass=True),
+    SlamRow("sequence + compass, lag 100", "sequence", lag=100, compass=True),
+    SlamRow("sequence + compass, batch, blind", "sequence", control="blind", compass=True),
+    SlamRow("sequence + compass, batch, shuffled", "sequence", control="shuffled", compass=True),
+)
+"""The sequence SLAM with the wall-line compass, which has controls of its own."""
+WITH_COMPASS: Final = ("plain", "yaw 4 deg, wander 4 mm")
 ROWS: Final = (
     *(SlamRow(f"sequence, {name}", "sequence", lag=lag) for name, lag in LAGS.items()),
     SlamRow("sequence, batch, max angle", "sequence", MAX_ANGLE),
     SlamRow("sequence, batch, blind", "sequence", control="blind"),
     SlamRow("sequence, batch, shuffled", "sequence", control="shuffled"),
     SlamRow("sequence, lag 100, shuffled", "sequence", lag=100, control="shuffled"),
+    SlamRow("sequence, batch, doubt 1 rad", "sequence", doubt=1.0),
+    SlamRow("sequence, lag 100, doubt 1 rad", "sequence", lag=100, doubt=1.0),
+    SlamRow("sequence, batch, doubt 1 rad, shuffled", "sequence", control="shuffled", doubt=1.0),
+    *COMPASS,
     SlamRow("RatSLAM, contact angle", "ratslam"),
     SlamRow("RatSLAM, contact angle, blind", "ratslam", control="blind"),
     SlamRow("RatSLAM, contact angle, shuffled", "ratslam", control="shuffled"),
@@ -119,7 +138,9 @@ class SlamWork:
 
     @property
     def rows(self) -> tuple[SlamRow, ...]:
-        return tuple(row for row in ROWS if self.group == "plain" or row.name in FEWER)
+        extra = COMPASS if self.group in WITH_COMPASS else ()
+        chosen = (row for row in ROWS if row.name in FEWER or row in extra)
+        return ROWS if self.group == "plain" else tuple(chosen)
 
 
 def works(seeds: int, quick: bool) -> list[SlamWork]:
@@ -240,7 +261,14 @@ def sequence_map(
     recording: Recording, motion: Floats, row: SlamRow, noise: OdometerNoise, seed: int
 ) -> tuple[Floats, NDArray[np.int64]]:
     """The whisks' poses float64[n, 3] in the final map, and its loops int64[m, 2]."""
-    slam = SequenceSlam(SequenceConfig(lag=row.lag, odometer=noise))
+    config = SequenceConfig(
+        lag=row.lag,
+        compass=row.compass,
+        memory=row.memory,
+        doubt=row.doubt,
+        odometer=noise,
+    )
+    slam = SequenceSlam(config, head_shape())
     for image, (v, w, dt) in zip(_images(recording, row, seed), motion.tolist(), strict=True):
         slam.step(image, Odometry(v, w, dt))
     found = slam.map()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from vibrissa.processes.results import silent
 from vibrissa.tools import bench_touch
 from vibrissa.tools.cli import app
 from vibrissa.tools.experiment import slam_report, slam_runs
+from vibrissa.tools.experiment.slam_markdown import interval, ratios
 from vibrissa.tools.experiment.slam_runs import NOISES, ROWS, VARIANTS, works
 
 
@@ -36,6 +38,11 @@ def test_the_quick_form_writes_its_report_and_goes_on_where_it_stopped(
     page = (tmp_path / "report.html").read_text()
     assert page.count("data:image/png") + page.count("<svg") >= 2
     assert all(row.name in page for row in ROWS)
+    table = (tmp_path / "report.md").read_text()
+    assert (
+        all(f"| {row.name} | " in table for row in ROWS) and "## plain (1 runs per cell)" in table
+    )
+    assert "| sequence, batch, blind | 1.00 / 1.00 / 1.00 (1.00, 1.00, 1.00); 0 0 0 |" in table
     again = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path)])
     assert "0 data sets to go" in again.output
 
@@ -51,7 +58,7 @@ def test_every_group_has_fresh_mazes_and_all_noises() -> None:
 
 
 def test_the_table_counts_wins_and_takes_geometric_means() -> None:
-    run = {
+    run: dict[str, Any] = {
         "group": "plain",
         "row": ROWS[0].name,
         "noise": "jit",
@@ -69,6 +76,8 @@ def test_the_table_counts_wins_and_takes_geometric_means() -> None:
     assert [cell[r]["wins"] for r in ("consecutive", "interval", "all")] == [2, 0, 1]
     assert (cell["n"], cell["ended"], cell["right"]) == (3, 1, 0.5)
     assert cell["all"]["worst"] == 2.0
+    assert ratios(cell) == "0.25 / 1.00 / 1.00 (0.50, 1.00, 2.00); 2 0 1; 1 ended"
+    assert interval(cell).endswith("; 4, 50.0 % right")
 
 
 def test_places_as_seen_from_the_first_pose() -> None:
