@@ -67,12 +67,6 @@ class CanEmulator(HeadEmulator):
             size = self._random.choice((0, 3, 8, 48, 64))
             self._put([(identifier, self._random.randbytes(size))])
 
-    def wire(self) -> int:
-        try:
-            return self._bus.fileno() if self._bus is not None else -1
-        except NotImplementedError:
-            return -1
-
     def take(self) -> None:
         while self._bus is not None:
             message = self._bus.recv(0)

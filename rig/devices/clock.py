@@ -80,21 +80,24 @@ class CycleTicks:
         """period: s, between cycles."""
         self._ticks_per_s = 2000.0
         self._period = period
-        self._last: tuple[float, int] | None = None
+        self._last: tuple[float, float] | None = None
 
-    def tick(self, stamp: float, now: int) -> int:
-        """The tick of the cycle stamped `stamp` s that came at tick `now`; always a later one."""
+    def tick(self, stamp: float, now: int, rate: float = 1.0) -> int:
+        """The tick of the cycle stamped `stamp` s that came at tick `now`; always a later one.
+
+        rate: how much faster the ticks' clock runs than the device's.
+        """
         if self._last is None:
-            self._last = stamp, max(now, 0)
-            return self._last[1]
+            self._last = stamp, float(max(now, 0))
+            return max(now, 0)
         before, last = self._last
         cycles = max(round((stamp - before) / self._period), 1)
-        tick = last + max(round(cycles * self._period * self._ticks_per_s), 1)
-        off = now - tick
+        exact = last + cycles * self._period * self._ticks_per_s * rate
+        off = now - exact
         if not -self.STEP < off < self.STEP:
-            tick = now
+            exact = now
         elif abs(off) > self.SLACK:
-            tick += 1 if off > 0 else -1
-        tick = max(tick, last + 1)
-        self._last = stamp, tick
-        return tick
+            exact += 1 if off > 0 else -1
+        exact = max(exact, round(last) + 1.0)
+        self._last = stamp, exact
+        return round(exact)

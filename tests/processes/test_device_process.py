@@ -177,6 +177,20 @@ def test_an_arm_that_is_well_is_enabled_at_tick_0_and_moves_as_it_is_told(
     assert world.arm.counters.refused == 0 and world.arm.counters.setpoints > 200
 
 
+@pytest.mark.parametrize("drift", [-0.1, 0.1])
+def test_an_arm_keeps_to_the_ticks_of_a_head_whose_clock_is_far_off(
+    drift: float, monkeypatch: Patch, tmp_path: Path
+) -> None:
+    world = ArmWorld(monkeypatch, tmp_path)
+    world.drift = drift
+    bus, retracts, _ = ran(world)
+    assert not retracts and world.arm.counters.refused == 0
+    ticks = [r.tick for r in bus.of("rig.arm")]
+    cycle = 16 / (1 + drift)
+    assert all(abs(b - a - cycle) <= 2 for a, b in pairwise(ticks))
+    assert ticks[-1] == pytest.approx(len(ticks) * cycle, abs=3 * cycle)
+
+
 STOPPING: dict[str, tuple[Callable[[ArmWorld], object], str, int]] = {
     "a stall": (
         lambda w: setattr(w.arm, "mute", True),
