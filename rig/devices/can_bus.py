@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import select
 import socket
 import struct
+from collections.abc import Sequence
 from typing import Any, Final
 
 import can
+from can.interfaces.udp_multicast.utils import pack_message
 
 from vibrissa.rig.devices.errors import DeviceAddressError, DeviceUnavailable
 
@@ -20,6 +23,10 @@ _HEADER = struct.Struct("<I")
 _KEEP: Final = 1 << 22
 _SO_RCVBUFFORCE: Final = 33
 """Linux: beyond the system's limit, for those who may."""
+_SO_ATTACH_FILTER: Final = 26
+_LOAD_WORD, _JUMP_IF_EQUAL, _RETURN = 0x20, 0x15, 0x06
+"""Of the kernel's packet filter (linux/bpf_common.h)."""
+_UDP_HEADER: Final = 8
 
 
 class LoopbackBus(can.BusABC):
@@ -77,6 +84,33 @@ def _keep_more(descriptor: int) -> None:
             same.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _KEEP)
 
 
+def _turn_deaf(bus: can.BusABC, identifiers: Sequence[int]) -> None:
+    """Have the kernel drop frames of these identifiers, so that a member need not hear itself.
+
+    A member of a bus of datagrams is woken for what it said, too. Drops only what is packed as
+    this end packs it; whatever else there is comes through.
+    """
+    words = []
+    at = 0
+    for identifier in identifiers:
+        if isinstance(bus, LoopbackBus):
+            packed = _HEADER.pack(identifier)
+        else:
+            packed = pack_message(_message(identifier, b""))
+            at = packed.index(b"arbitration_id") + len("arbitration_i")  # and the id behind it
+        words.append(int.from_bytes(packed[at : at + 4], "big"))
+    steps = [(_LOAD_WORD, 0, 0, _UDP_HEADER + at)]
+    steps += [(_JUMP_IF_EQUAL, len(words) - k, 0, word) for k, word in enumerate(words)]
+    steps += [(_RETURN, 0, 0, 0xFFFFFFFF), (_RETURN, 0, 0, 0)]
+    program = ctypes.create_string_buffer(b"".join(struct.pack("HBBI", *step) for step in steps))
+    with socket.socket(fileno=os.dup(bus.fileno())) as same:
+        same.setsockopt(
+            socket.SOL_SOCKET,
+            _SO_ATTACH_FILTER,
+            struct.pack("HL", len(steps), ctypes.addressof(program)),
+        )
+
+
 def _message(identifier: int, data: bytes) -> can.Message:
     return can.Message(
         arbitration_id=identifier,
@@ -95,24 +129,27 @@ def send_frame(bus: can.BusABC, identifier: int, data: bytes) -> None:
         raise OSError(str(error)) from None
 
 
-def open_bus(name: str, interface: str, channel: str) -> can.BusABC:
-    """A bus; `name` is for messages. Raises DeviceAddressError or DeviceUnavailable."""
+def open_bus(name: str, interface: str, channel: str, own: Sequence[int] = ()) -> can.BusABC:
+    """A bus; `name` is for messages. Raises DeviceAddressError or DeviceUnavailable.
+
+    own: identifiers that only this member sends, and need not hear.
+    """
     if interface not in INTERFACES:
         raise DeviceAddressError(
             f"{name}: interface: expected one of {', '.join(INTERFACES)}, found {interface!r}"
         )
-    if interface == "loopback":
-        if not channel.isdigit() or not 1024 <= int(channel) < 2**16:
-            raise DeviceAddressError(f"{name}: channel: expected a port, found {channel!r}")
-        try:
-            return LoopbackBus(channel)
-        except OSError as error:
-            raise DeviceUnavailable(f"{name}: can't be opened: {error.strerror}") from None
+    if interface == "loopback" and (not channel.isdigit() or not 1024 <= int(channel) < 2**16):
+        raise DeviceAddressError(f"{name}: channel: expected a port, found {channel!r}")
     options: dict[str, Any] = {"udp_multicast": {"hop_limit": 0}}.get(interface, {})
     try:
-        bus = can.Bus(interface=interface, channel=channel, fd=True, **options)
+        if interface == "loopback":
+            bus: can.BusABC = LoopbackBus(channel)
+        else:
+            bus = can.Bus(interface=interface, channel=channel, fd=True, **options)
         if interface == "udp_multicast":
             _keep_more(bus.fileno())
+        if own and interface in ("loopback", "udp_multicast"):
+            _turn_deaf(bus, own)
         return bus
     except (can.CanError, OSError, ValueError, NotImplementedError) as error:
         text = str(error).splitlines()[0] if str(error) else type(error).__name__

@@ -19,6 +19,7 @@ import can
 
 from vibrissa.rig.devices.can_bus import close_bus, open_bus, send_frame
 from vibrissa.rig.devices.can_layout import (
+    FROM_HEAD,
     Frame,
     pack_hello,
     pack_sample,
@@ -40,7 +41,7 @@ class CanEmulator(HeadEmulator):
         self._replug_at: float | None = None
 
     def _open(self) -> can.BusABC:
-        return open_bus("can emulator", self._interface, self._channel)
+        return open_bus("can emulator", self._interface, self._channel, FROM_HEAD)
 
     def more_orders(self) -> dict[str, Callable[..., object]]:
         return {"unplug": self.unplug, "impostor": self.impostor, "noise": self.noise}

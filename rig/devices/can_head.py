@@ -13,12 +13,12 @@ from vibrissa.rig.devices.can_bus import (
     open_bus,
     send_frame,
 )
-from vibrissa.rig.devices.can_layout import Assembler, check_bus_load, pack_from_host
+from vibrissa.rig.devices.can_layout import FROM_HOST, Assembler, check_bus_load, pack_from_host
 from vibrissa.rig.devices.head import HeadDevice
 from vibrissa.rig.devices.limits import HEAD
 from vibrissa.rig.devices.protocol import FromHead, FromHost
 
-MANY = 512
+MANY = 128
 """Frames taken at once."""
 PARTNER_S = 0.0003
 """How long to wait for a sample's other frame, which takes 0.15 ms on the wire: less than another
@@ -53,7 +53,7 @@ class CanHead(HeadDevice):
             return -1
 
     def _open_link(self) -> None:
-        self._bus = open_bus(self.name, self._interface, self._channel)
+        self._bus = open_bus(self.name, self._interface, self._channel, FROM_HOST)
         self._assembler.restart()
 
     def _close_link(self) -> None:

@@ -175,25 +175,33 @@ class HeadDevice(ABC):
         after an interruption is not the head that was there before.
         """
         ready = self._ready
-        if ready:
-            return ready.popleft()
         deadline = time.monotonic_ns() + int(timeout * 1e9)
-        while True:
-            now = time.monotonic_ns()
-            self._look_after(now)
-            left = max(deadline - now, 0) * 1e-9
-            if self._linked:
-                wait = min(left, SILENCE_S)
-                try:
-                    self._take(self._receive(wait))
-                except OSError:
-                    self._unlink()
-            elif left > 0.0:
-                time.sleep(min(left, 0.01))
-            if ready:
-                return ready.popleft()
-            if time.monotonic_ns() >= deadline:
+        while not ready:
+            left = max(deadline - time.monotonic_ns(), 0) * 1e-9
+            self._listen(min(left, SILENCE_S))
+            if not ready and time.monotonic_ns() >= deadline:
                 return None
+        return ready.popleft()
+
+    def poll(self, timeout: float = 0.0) -> list[Reading]:
+        """All that one look at the wire brings, waiting for it no longer than `timeout` s.
+
+        What is left comes with the next. Raises as `read` does.
+        """
+        self._listen(timeout)
+        found = list(self._ready)
+        self._ready.clear()
+        return found
+
+    def _listen(self, timeout: float) -> None:
+        self._look_after(time.monotonic_ns())
+        if self._linked:
+            try:
+                self._take(self._receive(timeout))
+            except OSError:
+                self._unlink()
+        elif timeout > 0.0:
+            time.sleep(min(timeout, 0.01))
 
     def write(self, tick: int, command: Float32s) -> bool:
         """Send the drives their set-points float32[18], rad, that answer the sample of `tick`.
