@@ -56,7 +56,7 @@ class SerialHead(HeadDevice):
 
     def _receive(self, timeout: float) -> Iterator[FromHead]:
         fd = self._serial.fileno()
-        if timeout > 0.0 and not select.select([fd], [], [], timeout)[0]:
+        if not select.select([fd], [], [], timeout)[0]:
             return iter(())
         try:
             data = os.read(fd, PIECE)
