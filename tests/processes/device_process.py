@@ -208,7 +208,7 @@ class ArmWorld(World):
     def guide(self, tick: int) -> None:
         """The set-point that answers the state of a tick."""
         x, y, z, yaw = self.goal
-        self.speed = min(self.speed + 0.008, 0.05) if self.bus.events("enabled") else 0.0
+        self.speed = min(self.speed + 0.004, 0.05) if self.bus.events("enabled") else 0.0
         self.goal = x + self.speed * 0.008, y, z, yaw
         self.bus.tell("arm.setpoint", "arm", ArmSetpoint(tick, np.array(self.goal)))
 
