@@ -49,6 +49,8 @@ OTHERS_S = 0.05
 """How long a second head may take to give itself away."""
 SILENCE_S: Final = 0.1
 RETRY_S: Final = 0.1
+FAR: Final = 2000
+"""Samples that may be missing, beside twice those of the time that has passed."""
 _WRAP: Final = 2**32
 
 
@@ -355,7 +357,7 @@ class HeadDevice(ABC):
             self.clock.forget()
         else:
             steps = (seq - self._seq) % _WRAP
-            if steps == 0 or steps > 2000 + 2 * self._elapsed(host_ns):
+            if steps == 0 or (steps > FAR and steps > FAR + 2 * self._elapsed(host_ns)):
                 self.counters.strays += 1
                 self._astray = steps != 0
                 if steps and host_ns - self._asked_ns > ASK_S * 1e9:
