@@ -197,6 +197,11 @@ STOPPING: dict[str, tuple[Callable[[ArmWorld], object], str, int]] = {
         f"no state, so no set-point for {ARM.stale_setpoint_ticks} ticks",
         ARM.stale_setpoint_ticks,
     ),
+    "a reboot of the controller": (
+        lambda w: w.arm.reboot(),
+        f"no state, so no set-point for {ARM.stale_setpoint_ticks} ticks",
+        ARM.stale_setpoint_ticks,
+    ),
     "no set-points": (
         lambda w: setattr(w, "guiding", False),
         f"no set-point for {ARM.stale_setpoint_ticks} ticks",
