@@ -12,12 +12,16 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import can
-from can.interfaces.udp_multicast.utils import pack_message
+from can.interfaces.udp_multicast import UdpMulticastBus
+from can.interfaces.udp_multicast.utils import pack_message, unpack_message
 
+from vibrissa.rig.devices.can_layout import Frame
 from vibrissa.rig.devices.errors import DeviceAddressError, DeviceUnavailable
 
 INTERFACES: Final = ("socketcan", "udp_multicast", "virtual", "loopback")
 BITRATE, DATA_BITRATE = 1_000_000, 5_000_000
+ERROR_ID: Final = -1
+"""Stands for a frame that the controller found to be damaged."""
 _EVERYBODY: Final = "127.255.255.255"
 _HEADER = struct.Struct("<I")
 _KEEP: Final = 1 << 22
@@ -52,17 +56,21 @@ class LoopbackBus(can.BusABC):
         self._in.bind(self._to)
         self._in.setblocking(False)
 
-    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+    def frame(self, timeout: float | None) -> Frame | None:
+        """The next frame of another member within `timeout` s."""
         while True:
             try:
                 data, sender = self._in.recvfrom(256)
             except BlockingIOError:
                 if timeout == 0 or not select.select([self._in], [], [], timeout)[0]:
-                    return None, False
+                    return None
                 continue
             if sender != self._me and 4 <= len(data) <= 68:
-                identifier = _HEADER.unpack_from(data)[0] & 0x7FF
-                return _message(identifier, data[4:]), False
+                return _HEADER.unpack_from(data)[0] & 0x7FF, data[4:]
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        frame = self.frame(timeout)
+        return (None if frame is None else _message(*frame)), False
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         self._out.sendto(_HEADER.pack(msg.arbitration_id) + bytes(msg.data), self._to)
@@ -74,6 +82,34 @@ class LoopbackBus(can.BusABC):
         super().shutdown()
         self._in.close()
         self._out.close()
+
+
+class MulticastBus(UdpMulticastBus):
+    """python-can's bus, read without what only its messages need: time stamps and checks."""
+
+    def __init__(self, channel: str) -> None:
+        super().__init__(channel, fd=True, hop_limit=0)
+        self._in = socket.socket(fileno=os.dup(self.fileno()))
+        _keep_more(self.fileno())
+
+    def frame(self, timeout: float) -> Frame | None:
+        """The next frame within `timeout` s, one's own ones too."""
+        while True:
+            try:
+                data = self._in.recv(4096, socket.MSG_DONTWAIT)
+            except BlockingIOError:
+                if timeout == 0 or not select.select([self._in], [], [], timeout)[0]:
+                    return None
+                continue
+            try:
+                message = unpack_message(data)
+                return message.arbitration_id, bytes(message.data)
+            except Exception:  # of msgpack and of python-can, for what is no frame
+                continue
+
+    def shutdown(self) -> None:
+        super().shutdown()
+        self._in.close()
 
 
 def _keep_more(descriptor: int) -> None:
@@ -129,6 +165,19 @@ def send_frame(bus: can.BusABC, identifier: int, data: bytes) -> None:
         raise OSError(str(error)) from None
 
 
+def receive_frame(bus: can.BusABC, timeout: float) -> Frame | None:
+    """The next frame within `timeout` s, 0 for what is there. Raises OSError."""
+    if isinstance(bus, LoopbackBus | MulticastBus):
+        return bus.frame(timeout)
+    try:
+        message = bus.recv(timeout)
+    except can.CanError as error:
+        raise OSError(str(error)) from None
+    if message is None:
+        return None
+    return (ERROR_ID if message.is_error_frame else message.arbitration_id), bytes(message.data)
+
+
 def open_bus(name: str, interface: str, channel: str, own: Sequence[int] = ()) -> can.BusABC:
     """A bus; `name` is for messages. Raises DeviceAddressError or DeviceUnavailable.
 
@@ -140,15 +189,14 @@ def open_bus(name: str, interface: str, channel: str, own: Sequence[int] = ()) -
         )
     if interface == "loopback" and (not channel.isdigit() or not 1024 <= int(channel) < 2**16):
         raise DeviceAddressError(f"{name}: channel: expected a port, found {channel!r}")
-    options: dict[str, Any] = {"udp_multicast": {"hop_limit": 0}}.get(interface, {})
     try:
         if interface == "loopback":
             bus: can.BusABC = LoopbackBus(channel)
+        elif interface == "udp_multicast":
+            bus = MulticastBus(channel)
         else:
-            bus = can.Bus(interface=interface, channel=channel, fd=True, **options)
-        if interface == "udp_multicast":
-            _keep_more(bus.fileno())
-        if own and interface in ("loopback", "udp_multicast"):
+            return can.Bus(interface=interface, channel=channel, fd=True)
+        if own:
             _turn_deaf(bus, own)
         return bus
     except (can.CanError, OSError, ValueError, NotImplementedError) as error:

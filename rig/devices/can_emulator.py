@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import can
 
-from vibrissa.rig.devices.can_bus import close_bus, open_bus, send_frame
+from vibrissa.rig.devices.can_bus import close_bus, open_bus, receive_frame, send_frame
 from vibrissa.rig.devices.can_layout import (
     FROM_HEAD,
     Frame,
@@ -70,12 +70,12 @@ class CanEmulator(HeadEmulator):
 
     def take(self) -> None:
         while self._bus is not None:
-            message = self._bus.recv(0)
-            if message is None:
+            frame = receive_frame(self._bus, 0.0)
+            if frame is None:
                 return
-            if not self.line.open() or self.line.hit(8 * len(message.data)):
+            if not self.line.open() or self.line.hit(8 * len(frame[1])):
                 continue
-            item = unpack_from_host((message.arbitration_id, bytes(message.data)))
+            item = unpack_from_host(frame)
             answer = self.firmware.hear(item) if item is not None else None
             if answer is not None:
                 self.greet(answer)
