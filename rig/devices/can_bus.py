@@ -72,8 +72,12 @@ class LoopbackBus(can.BusABC):
         frame = self.frame(timeout)
         return (None if frame is None else _message(*frame)), False
 
+    def put(self, identifier: int, data: bytes) -> None:
+        """Send one frame."""
+        self._out.sendto(_HEADER.pack(identifier) + data, self._to)
+
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        self._out.sendto(_HEADER.pack(msg.arbitration_id) + bytes(msg.data), self._to)
+        self.put(msg.arbitration_id, bytes(msg.data))
 
     def fileno(self) -> int:
         return self._in.fileno()
@@ -85,12 +89,19 @@ class LoopbackBus(can.BusABC):
 
 
 class MulticastBus(UdpMulticastBus):
-    """python-can's bus, read without what only its messages need: time stamps and checks."""
+    """python-can's bus without what only its messages need: time stamps, checks, and one each."""
 
     def __init__(self, channel: str) -> None:
         super().__init__(channel, fd=True, hop_limit=0)
         self._in = socket.socket(fileno=os.dup(self.fileno()))
+        self._message = _message(0, b"")
         _keep_more(self.fileno())
+
+    def put(self, identifier: int, data: bytes) -> None:
+        """Send one frame. Raises CanError."""
+        message = self._message
+        message.arbitration_id, message.dlc, message.data = identifier, len(data), bytearray(data)
+        self.send(message)
 
     def frame(self, timeout: float) -> Frame | None:
         """The next frame within `timeout` s, one's own ones too."""
@@ -160,7 +171,10 @@ def _message(identifier: int, data: bytes) -> can.Message:
 def send_frame(bus: can.BusABC, identifier: int, data: bytes) -> None:
     """Put one FD frame on a bus. Raises OSError."""
     try:
-        bus.send(_message(identifier, data))
+        if isinstance(bus, LoopbackBus | MulticastBus):
+            bus.put(identifier, data)
+        else:
+            bus.send(_message(identifier, data))
     except can.CanError as error:
         raise OSError(str(error)) from None
 
