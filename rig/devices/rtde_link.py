@@ -12,7 +12,6 @@ reason why it can't, and then every request with one byte: b"1" done, b"0" not.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import select
 import signal
@@ -21,7 +20,6 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from typing import Any, Final
 
 STATE = struct.Struct("<d6d6d6dIi")
@@ -33,9 +31,6 @@ EARLY_S: Final = 0.002
 """How long before the next state is due polling begins."""
 PRIORITY: Final = 30
 """Of SCHED_FIFO, where the parent has it."""
-SLACK_NS: Final = 500_000
-"""By how much the kernel may let ur-rtde's threads oversleep: they look for data every 0.1 ms."""
-_PR_SET_TIMERSLACK: Final = 29
 LOOKAHEAD: Final = 0.03
 GAIN: Final = 1000.0
 VARIABLES: Final = [
@@ -101,8 +96,7 @@ def listen(link: socket.socket, host: str, frequency: float) -> None:
     """Pass on every state, until the controller or the parent is gone."""
     from rtde_receive import RTDEReceiveInterface
 
-    with _at_leisure():
-        receiver = RTDEReceiveInterface(host, frequency, VARIABLES)
+    receiver = RTDEReceiveInterface(host, frequency, VARIABLES)
     pause = max(1.0 / frequency - EARLY_S, 0.0)
     last = receiver.getTimestamp()
     while receiver.isConnected():
@@ -130,8 +124,7 @@ def control(link: socket.socket, host: str, frequency: float, period: float, bra
     if link.recv(256) != ENABLE:
         return
     try:
-        with _at_leisure():
-            controller: Any = RTDEControlInterface(host, 1.0 / period)
+        controller: Any = RTDEControlInterface(host, 1.0 / period)
         if not controller.setWatchdog(frequency):
             raise RuntimeError("the watchdog can't be set")
     except (RuntimeError, ValueError) as error:
@@ -153,27 +146,11 @@ def control(link: socket.socket, host: str, frequency: float, period: float, bra
 
 
 def _make_way() -> None:
-    """Run where there is room, after everybody else who is in a hurry."""
+    """Run where there is room, ur-rtde's threads after everybody else who is in a hurry."""
     with contextlib.suppress(OSError):
         os.sched_setaffinity(0, range(os.cpu_count() or 1))
         if os.sched_getscheduler(0) == os.SCHED_FIFO:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-
-
-@contextlib.contextmanager
-def _at_leisure() -> Iterator[None]:
-    """Threads that are started in here are ordinary ones, whose short sleeps take longer."""
-    prctl = ctypes.CDLL(None).prctl
-    policy, priority = os.sched_getscheduler(0), os.sched_getparam(0)
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    prctl(_PR_SET_TIMERSLACK, SLACK_NS, 0, 0, 0)
-    try:
-        yield
-    finally:
-        prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
-        with contextlib.suppress(OSError):
-            os.sched_setscheduler(0, policy, priority)
 
 
 def main() -> None:
