@@ -22,26 +22,39 @@ from vibrissa.processes.framelog import frame_of
 from vibrissa.processes.results import OnProgress, RunError
 from vibrissa.processes.supervisor import run_live
 from vibrissa.processes.verify import verify
+from vibrissa.rig.devices.can_bus import close_bus, open_bus
 from vibrissa.rig.devices.can_layout import Assembler, pack_sample
+from vibrissa.rig.devices.errors import DeviceUnavailable
 from vibrissa.rig.devices.framing import FrameParser, frame
 from vibrissa.rig.devices.protocol import RawSample, pack_from_head, unpack_from_head
 from vibrissa.tools.bench import Bench, Target
 from vibrissa.tools.run import next_directory
 
-RIGS: Final = {
-    "virtual": Rig(),
-    "serial": Rig(head="serial:emulated", arm="rtde:emulated", emulate=True),
-    "can": Rig(head="can:loopback:emulated", arm="rtde:emulated", emulate=True),
-}
+MULTICAST: Final = "239.74.163.19"
+"""A group of its own, so that a bench hears no other program's frames."""
 STREAM_HZ: Final = 2000
 QUICK_S: Final = 3.0
+
+
+def rigs() -> dict[str, Rig]:
+    """What is compared. CAN goes by multicast where this kernel has it, else by broadcast."""
+    bus = f"can:udp_multicast:{MULTICAST}"
+    try:
+        close_bus(open_bus("bench", "udp_multicast", MULTICAST))
+    except DeviceUnavailable:
+        bus = "can:loopback:emulated"
+    return {
+        "virtual": Rig(),
+        "serial": Rig(head="serial:emulated", arm="rtde:emulated", emulate=True),
+        "can": Rig(head=bus, arm="rtde:emulated", emulate=True),
+    }
 
 
 def bench(out: Path, duration: float, on_progress: OnProgress, *, quick: bool = False) -> Bench:
     """Measure; the runs are kept in `out`. quick: three seconds of each."""
     experiment = load_experiment(duration=min(duration, QUICK_S) if quick else duration)
     rows = []
-    for name, rig in RIGS.items():
+    for name, rig in rigs().items():
         asked = experiment.model_copy(update={"rig": rig})
         rows.append(measured(name, asked, next_directory(name, out), on_progress))
     parsers = [parser_row(name) for name in ("serial", "can")]
@@ -62,6 +75,7 @@ def measured(
     latency = summary["latency_us"].get("head-device") or summary["latency_us"]["sampler"]
     return {
         "rig": name,
+        "head": experiment.rig.head,
         "cause": summary["cause"],
         "ticks": summary["ticks"],
         "samples_lost": device.get("lost", 0),
