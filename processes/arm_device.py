@@ -118,6 +118,7 @@ class ArmPump(Pump):
         except DeviceError as error:
             self.give_up(str(error))
             return
+        self.drain()  # states of that time need no answer
         self.hear()  # set-points of that time lapse, and a stop wins
         if not self.watch.start(self.now):
             self.halt(self.watch.cause)

@@ -291,6 +291,25 @@ def test_a_stop_that_is_said_while_the_arm_is_enabled_wins(
     assert all(speed == 0.0 for _, speed in speeds)
 
 
+def test_states_that_waited_while_the_arm_was_enabled_are_not_answered(
+    monkeypatch: Patch, tmp_path: Path
+) -> None:
+    world = ArmWorld(monkeypatch, tmp_path)
+    world.orders[-100] = lambda: setattr(world.arm, "_start_motion", lambda: world.clock.sleep(0.2))
+    said_at: list[int] = []
+    publish = world.bus.publish
+
+    def noting(frame: bytes) -> None:
+        publish(frame)
+        if world.bus.said[-1].topic == "rig.arm":
+            said_at.append(world.bus.tick)
+
+    monkeypatch.setattr(world.bus, "publish", noting)
+    bus, retracts, _ = ran(world)
+    assert not retracts and bus.events("enabled")
+    assert said_at[0] >= 400 and all(b - a >= 15 for a, b in pairwise(said_at))
+
+
 def test_a_retract_of_the_heads_process_stops_the_arm_and_later_set_points_are_ignored(
     monkeypatch: Patch, tmp_path: Path
 ) -> None:
