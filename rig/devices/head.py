@@ -212,7 +212,7 @@ class HeadDevice(ABC):
         DeviceLimit before anything is sent.
         """
         self.limits.check(tick, command)
-        counts = np.rint(command / np.float32(self.info.command_scale)).astype("<i2")
+        counts = np.rint(command / self._command_scale).astype("<i2")
         if not self._linked or not self._try_to_send(Command(tick % _WRAP, counts.tobytes())):
             self.counters.unsent += 1
             return False
@@ -276,6 +276,7 @@ class HeadDevice(ABC):
 
     def _adopt(self, hello: Hello) -> None:
         self.info = hello
+        self._command_scale = np.float32(hello.command_scale)
         where = {(c.kind, c.whisker): k for k, c in enumerate(hello.channels)}
         kinds = (protocol.THETA, protocol.X, protocol.Y)
         order = [where[kind, i] for kind in kinds for i in range(WHISKERS)]
