@@ -3,12 +3,14 @@
 Runs follow one another in one call: virtual, serial, CAN FD; the arm over RTDE in the latter two.
 Of each: samples and messages lost, the time from a sample's arrival to the command that answers it,
 and how many ticks later the drives obey, as the head itself reports it. Beside them how much faster
-than the stream the parsers read.
+than the stream the parsers read. On fewer than four cores `sampler` and `whisk` share a process in
+all three: emulators take the place of hardware, and of its cores.
 """
 
 from __future__ import annotations
 
 import math
+import os
 import time
 from pathlib import Path
 from typing import Any, Final
@@ -33,6 +35,8 @@ from vibrissa.tools.run import next_directory
 MULTICAST: Final = "239.74.163.19"
 """A group of its own, so that a bench hears no other program's frames."""
 STREAM_HZ: Final = 2000
+ROOM: Final = 4
+"""Cores from which on every node has a process of its own."""
 QUICK_S: Final = 3.0
 
 
@@ -53,6 +57,9 @@ def rigs() -> dict[str, Rig]:
 def bench(out: Path, duration: float, on_progress: OnProgress, *, quick: bool = False) -> Bench:
     """Measure; the runs are kept in `out`. quick: three seconds of each."""
     experiment = load_experiment(duration=min(duration, QUICK_S) if quick else duration)
+    if len(os.sched_getaffinity(0)) < ROOM:
+        close = experiment.run.model_copy(update={"together": [["sampler", "whisk"]]})
+        experiment = experiment.model_copy(update={"run": close})
     rows = []
     for name, rig in rigs().items():
         asked = experiment.model_copy(update={"rig": rig})
@@ -76,6 +83,7 @@ def measured(
     return {
         "rig": name,
         "head": experiment.rig.head,
+        "together": ", ".join("+".join(names) for names in experiment.run.together),
         "cause": summary["cause"],
         "ticks": summary["ticks"],
         "samples_lost": device.get("lost", 0),
