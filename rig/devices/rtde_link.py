@@ -27,7 +27,7 @@ STATE = struct.Struct("<d6d6d6dIi")
 POSE = struct.Struct("<6d")
 ENABLE, SERVO, HALT, RUNNING = b"E", b"S", b"H", b"R"
 POLL_S: Final = 0.0005
-EARLY_S: Final = 0.001
+EARLY_S: Final = 0.002
 """How long before the next state is due polling begins."""
 PRIORITY: Final = 30
 """Of SCHED_FIFO, where the parent has it."""
