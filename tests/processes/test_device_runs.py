@@ -41,6 +41,7 @@ from vibrissa.tools.recording import of_log, to_log
 FILE = """\
 [run]
 duration = {duration}
+together = [["sampler", "whisk"]]
 [whisk]
 period = 1.0
 calibration_cycles = 1
