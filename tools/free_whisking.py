@@ -23,6 +23,10 @@ ATTEMPTS = 20
 """How often free whisking may be disturbed by a late controller and begin again."""
 
 
+CLOSE: Final = [["sampler", "whisk"]]
+"""In one process: commands come in time on small machines too, and there is nothing to isolate."""
+
+
 def only_whisking(experiment: Experiment, cycles: int) -> Experiment:
     """The experiment up to its calibration, with an arm that is left alone."""
     period = experiment.whisk.period
@@ -30,7 +34,7 @@ def only_whisking(experiment: Experiment, cycles: int) -> Experiment:
     fresh = {"calibration": "", "calibration_text": "", "calibration_cycles": cycles}
     return experiment.model_copy(
         update={
-            "run": experiment.run.model_copy(update={"duration": duration}),
+            "run": experiment.run.model_copy(update={"duration": duration, "together": CLOSE}),
             "rig": experiment.rig.model_copy(update={"arm": "virtual"}),
             "whisk": experiment.whisk.model_copy(update=fresh),
             "swap": [],
