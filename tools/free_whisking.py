@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import tempfile
 from pathlib import Path
+from typing import Final
 
 from vibrissa.control.calibration import Calibration
 from vibrissa.control.kinematics import WHISKERS, whisker_name
@@ -19,7 +20,7 @@ from vibrissa.processes.supervisor import Supervisor
 from vibrissa.processes.whisk import from_message
 from vibrissa.tools.console import progress_bar, stdout, table
 
-ATTEMPTS = 20
+ATTEMPTS: Final = 20
 """How often free whisking may be disturbed by a late controller and begin again."""
 
 
