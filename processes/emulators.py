@@ -48,7 +48,7 @@ def devices(experiment: Experiment, folder: Path) -> Iterator[Devices]:
             emulator = stack.enter_context(EmulatorProcess(kind, arguments))
             found.emulators[what] = emulator
             if experiment.run.realtime:
-                _favour(emulator.pid)
+                _favour(emulator.pid, head=what == "head")
             return emulator
 
         pose = ",".join(map(repr, make_path(experiment).pose(0)))
@@ -71,16 +71,16 @@ def devices(experiment: Experiment, folder: Path) -> Iterator[Devices]:
         yield found
 
 
-def _favour(pid: int) -> None:
-    """Have an emulator run before everybody else, where it disturbs least.
+def _favour(pid: int, *, head: bool) -> None:
+    """Have an emulator run before everybody else, and a head where it disturbs least.
 
     Of two cores that is the one of the reflex loop: the head waits while that works and the other
-    way round, and the other core has enough to do with what reads the head.
+    way round. Who runs first is never moved, and the other core has enough to do.
     """
     with contextlib.suppress(OSError):
         os.sched_setscheduler(pid, os.SCHED_FIFO, os.sched_param(PRIORITY))
         cores = os.sched_getaffinity(0)
-        if len(cores) == 2:
+        if head and len(cores) == 2:
             os.sched_setaffinity(pid, choose_cores(cores, "reflex"))
 
 

@@ -146,13 +146,9 @@ def control(link: socket.socket, host: str, frequency: float, period: float, bra
 
 
 def _make_way() -> None:
-    """Run where there is room, ur-rtde's threads after everybody else who is in a hurry.
-
-    Of two cores that is the second: the first has the process that reads the head.
-    """
+    """Run where there is room, ur-rtde's threads after everybody else who is in a hurry."""
     with contextlib.suppress(OSError):
-        cores = range(os.cpu_count() or 1)
-        os.sched_setaffinity(0, cores[1:] if len(cores) == 2 else cores)
+        os.sched_setaffinity(0, range(os.cpu_count() or 1))
         if os.sched_getscheduler(0) == os.SCHED_FIFO:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
 
