@@ -118,6 +118,7 @@ class ArmPump(Pump):
         except DeviceError as error:
             self.give_up(str(error))
             return
+        self.drain()  # states of that time need no answer
         self.hear()  # set-points of that time lapse, and a stop wins
         if not self.watch.start(self.now):
             self.halt(self.watch.cause)
@@ -130,7 +131,8 @@ class ArmPump(Pump):
         now = self._tick_at(report.host_ns - self.t0)
         if now < 0:
             return
-        tick = self._cycles.tick(report.stamp, now)
+        rate = _rate(self._arm.clock.drift) / self._head_rate
+        tick = self._cycles.tick(report.stamp, now, rate)
         if tick > self.last_tick:
             self.watch.stop("the run is over")
             self.halt("the run is over")
@@ -145,12 +147,22 @@ class ArmPump(Pump):
         clock = self._head_clock
         if clock is None:
             return host_ns // TICK_NS
-        return clock.tick + round((host_ns - clock.host_ns) / (TICK_NS * (1.0 + clock.drift)))
+        return clock.tick + round((host_ns - clock.host_ns) / (TICK_NS * self._head_rate))
+
+    @property
+    def _head_rate(self) -> float:
+        """How much faster the host's clock runs than the head's; 1 until that is known."""
+        return _rate(self._head_clock.drift) if self._head_clock else 1.0
 
     def _tell(self, pose: Pose) -> None:
         """An emulated head must feel the walls where this arm carries it."""
         if self._mouth is not None:
             self._mouth.tell(pose)
+
+
+def _rate(drift: float) -> float:
+    """The rate of a drift; no clock that is of use is off by more than half."""
+    return 1.0 + min(max(drift, -0.5), 0.5)
 
 
 def travelled(path: ArmPath, ticks: int, period: float) -> list[Pose]:

@@ -13,6 +13,7 @@ from typing import Final
 
 from vibrissa.processes.arm import make_path
 from vibrissa.processes.config import Experiment
+from vibrissa.processes.realtime import choose_cores
 from vibrissa.processes.results import RunError
 from vibrissa.processes.rig import head_settings
 from vibrissa.rig.devices.addresses import make_arm, make_head, parse
@@ -47,8 +48,7 @@ def devices(experiment: Experiment, folder: Path) -> Iterator[Devices]:
             emulator = stack.enter_context(EmulatorProcess(kind, arguments))
             found.emulators[what] = emulator
             if experiment.run.realtime:
-                with contextlib.suppress(OSError):
-                    os.sched_setscheduler(emulator.pid, os.SCHED_FIFO, os.sched_param(PRIORITY))
+                _favour(emulator.pid, head=what == "head")
             return emulator
 
         pose = ",".join(map(repr, make_path(experiment).pose(0)))
@@ -69,6 +69,19 @@ def devices(experiment: Experiment, folder: Path) -> Iterator[Devices]:
         elif hear:
             found.urls["tell"] = str(hear)
         yield found
+
+
+def _favour(pid: int, *, head: bool) -> None:
+    """Have an emulator run before everybody else, and a head where it disturbs least.
+
+    Of two cores that is the one of the reflex loop: the head waits while that works and the other
+    way round. Who runs first is never moved, and the other core has enough to do.
+    """
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(pid, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        cores = os.sched_getaffinity(0)
+        if head and len(cores) == 2:
+            os.sched_setaffinity(pid, choose_cores(cores, "reflex"))
 
 
 def _head_wire(url: str, folder: Path) -> tuple[str, list[str], str]:

@@ -28,7 +28,7 @@ VIRTUAL_WAIT_S: Final = 0.00025
 """A virtual head has nothing to wait on."""
 PROBES: Final = 4096
 MANY: Final = 200
-"""Samples taken in a row: a process too slow for its head must still hear everybody else."""
+"""Times the head is read in a row before the run."""
 
 
 class HeadPump(Pump):
@@ -54,7 +54,6 @@ class HeadPump(Pump):
             self.device = self._head = make_head(url)
         self._base: int | None = None
         self._next = 0
-        self._behind = False
         self._due = (0, 0, 1.0)
         self._went_out = [0] * PROBES
         self._told = dataclasses.asdict(self._head.counters)
@@ -70,23 +69,15 @@ class HeadPump(Pump):
 
     def drain(self) -> None:
         for _ in range(MANY):
-            if self._head.read(0) is None:
+            if not self._head.poll():
                 return
 
     def turn(self) -> None:
         wire = self._head.fileno()
         if wire >= 0:
-            self.port.wait(wire, 0.0 if self._behind else WAIT_S)
-        timeout = 0.0 if wire >= 0 else VIRTUAL_WAIT_S
-        self._behind = False
-        for _ in range(MANY):
-            reading = self._head.read(timeout)
-            if reading is None:
-                break
+            self.port.wait(wire, WAIT_S)
+        for reading in self._head.poll(0.0 if wire >= 0 else VIRTUAL_WAIT_S):
             self._sampled(reading)
-            timeout = 0.0
-        else:
-            self._behind = True
         self.hear()
         if not self.done:
             self.look(self.now)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import tempfile
 from pathlib import Path
+from typing import Final
 
 from vibrissa.control.calibration import Calibration
 from vibrissa.control.kinematics import WHISKERS, whisker_name
@@ -19,8 +20,12 @@ from vibrissa.processes.supervisor import Supervisor
 from vibrissa.processes.whisk import from_message
 from vibrissa.tools.console import progress_bar, stdout, table
 
-ATTEMPTS = 20
+ATTEMPTS: Final = 20
 """How often free whisking may be disturbed by a late controller and begin again."""
+
+
+CLOSE: Final = [["sampler", "whisk"]]
+"""In one process: commands come in time on small machines too, and there is nothing to isolate."""
 
 
 def only_whisking(experiment: Experiment, cycles: int) -> Experiment:
@@ -30,7 +35,7 @@ def only_whisking(experiment: Experiment, cycles: int) -> Experiment:
     fresh = {"calibration": "", "calibration_text": "", "calibration_cycles": cycles}
     return experiment.model_copy(
         update={
-            "run": experiment.run.model_copy(update={"duration": duration}),
+            "run": experiment.run.model_copy(update={"duration": duration, "together": CLOSE}),
             "rig": experiment.rig.model_copy(update={"arm": "virtual"}),
             "whisk": experiment.whisk.model_copy(update=fresh),
             "swap": [],

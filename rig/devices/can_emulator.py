@@ -17,8 +17,9 @@ from dataclasses import replace
 
 import can
 
-from vibrissa.rig.devices.can_bus import close_bus, open_bus, send_frame
+from vibrissa.rig.devices.can_bus import close_bus, open_bus, receive_frame, send_frame
 from vibrissa.rig.devices.can_layout import (
+    FROM_HEAD,
     Frame,
     pack_hello,
     pack_sample,
@@ -40,7 +41,7 @@ class CanEmulator(HeadEmulator):
         self._replug_at: float | None = None
 
     def _open(self) -> can.BusABC:
-        return open_bus("can emulator", self._interface, self._channel)
+        return open_bus("can emulator", self._interface, self._channel, FROM_HEAD)
 
     def more_orders(self) -> dict[str, Callable[..., object]]:
         return {"unplug": self.unplug, "impostor": self.impostor, "noise": self.noise}
@@ -67,20 +68,14 @@ class CanEmulator(HeadEmulator):
             size = self._random.choice((0, 3, 8, 48, 64))
             self._put([(identifier, self._random.randbytes(size))])
 
-    def wire(self) -> int:
-        try:
-            return self._bus.fileno() if self._bus is not None else -1
-        except NotImplementedError:
-            return -1
-
     def take(self) -> None:
         while self._bus is not None:
-            message = self._bus.recv(0)
-            if message is None:
+            frame = receive_frame(self._bus, 0.0)
+            if frame is None:
                 return
-            if not self.line.open() or self.line.hit(8 * len(message.data)):
+            if not self.line.open() or self.line.hit(8 * len(frame[1])):
                 continue
-            item = unpack_from_host((message.arbitration_id, bytes(message.data)))
+            item = unpack_from_host(frame)
             answer = self.firmware.hear(item) if item is not None else None
             if answer is not None:
                 self.greet(answer)

@@ -9,16 +9,18 @@ import can
 from vibrissa.rig.devices.can_bus import (
     BITRATE,
     DATA_BITRATE,
+    ERROR_ID,
     close_bus,
     open_bus,
+    receive_frame,
     send_frame,
 )
-from vibrissa.rig.devices.can_layout import Assembler, check_bus_load, pack_from_host
+from vibrissa.rig.devices.can_layout import FROM_HOST, Assembler, check_bus_load, pack_from_host
 from vibrissa.rig.devices.head import HeadDevice
 from vibrissa.rig.devices.limits import HEAD
 from vibrissa.rig.devices.protocol import FromHead, FromHost
 
-MANY = 512
+MANY = 128
 """Frames taken at once."""
 PARTNER_S = 0.0003
 """How long to wait for a sample's other frame, which takes 0.15 ms on the wire: less than another
@@ -53,7 +55,7 @@ class CanHead(HeadDevice):
             return -1
 
     def _open_link(self) -> None:
-        self._bus = open_bus(self.name, self._interface, self._channel)
+        self._bus = open_bus(self.name, self._interface, self._channel, FROM_HOST)
         self._assembler.restart()
 
     def _close_link(self) -> None:
@@ -64,23 +66,20 @@ class CanHead(HeadDevice):
         bus, assembler, counters = self._bus, self._assembler, self.counters
         assert bus is not None
         items: list[FromHead] = []
-        try:
-            for _ in range(MANY):
-                message = bus.recv(timeout)
-                if message is None:
-                    break
-                timeout = 0.0
-                if message.is_error_frame:
-                    counters.crc_errors += 1
-                    continue
-                counters.bytes += len(message.data)
-                item = assembler.take((message.arbitration_id, bytes(message.data)))
-                if item is not None:
-                    items.append(item)
-                elif assembler.halfway:
-                    timeout = PARTNER_S
-        except can.CanError as error:
-            raise OSError(str(error)) from None
+        for _ in range(MANY):
+            frame = receive_frame(bus, timeout)
+            if frame is None:
+                break
+            timeout = 0.0
+            if frame[0] == ERROR_ID:
+                counters.crc_errors += 1
+                continue
+            counters.bytes += len(frame[1])
+            item = assembler.take(frame)
+            if item is not None:
+                items.append(item)
+            elif assembler.halfway:
+                timeout = PARTNER_S
         counters.frames, counters.resyncs = assembler.frames, assembler.incomplete
         return iter(items)
 

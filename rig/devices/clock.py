@@ -21,6 +21,8 @@ class ClockRelation:
         self._points: collections.deque[tuple[int, int]] = collections.deque(maxlen=KEPT)
         self._begin: int | None = None
         self._best = (0, 0)
+        self._centre = (0.0, 0.0)
+        self._slope = 0.0
 
     def see(self, device_ns: int, host_ns: int) -> None:
         """A message stamped `device_ns` arrived at `host_ns`."""
@@ -30,6 +32,7 @@ class ClockRelation:
         elif device_ns - self._begin >= STRETCH_NS:
             self._points.append(self._best)
             self._begin, self._best = device_ns, (device_ns, delay)
+            self._draw()
         elif delay < self._best[1]:
             self._best = (device_ns, delay)
 
@@ -37,31 +40,30 @@ class ClockRelation:
         """The device's clock has started afresh."""
         self._points.clear()
         self._begin = None
+        self._slope = 0.0
 
     @property
     def drift(self) -> float:
         """How much faster the host's clock runs: 1e-6 is one ppm; 0 until it can be told."""
-        if len(self._points) < 2:
-            return 0.0
-        _, _, xx, xy = self._sums()
-        return xy / xx if xx else 0.0
+        return self._slope
 
     def host_ns(self, device_ns: int) -> int:
         """Host time at a device time, less the smallest delay of the line."""
         if not self._points:
             return device_ns + self._best[1]
-        x, y, xx, xy = self._sums()
-        slope = xy / xx if xx else 0.0
-        return round(device_ns + y + slope * (device_ns - x))
+        x, y = self._centre
+        return round(device_ns + y + self._slope * (device_ns - x))
 
-    def _sums(self) -> tuple[float, float, float, float]:
+    def _draw(self) -> None:
+        """The line of least squares through the points kept."""
         n = len(self._points)
         x0, y0 = self._points[0]
         x = sum(p[0] - x0 for p in self._points) / n
         y = sum(p[1] - y0 for p in self._points) / n
         xx = sum((p[0] - x0 - x) ** 2 for p in self._points)
         xy = sum((p[0] - x0 - x) * (p[1] - y0 - y) for p in self._points)
-        return x0 + x, y0 + y, xx, xy
+        self._centre = x0 + x, y0 + y
+        self._slope = xy / xx if xx else 0.0
 
 
 class CycleTicks:
@@ -80,21 +82,24 @@ class CycleTicks:
         """period: s, between cycles."""
         self._ticks_per_s = 2000.0
         self._period = period
-        self._last: tuple[float, int] | None = None
+        self._last: tuple[float, float] | None = None
 
-    def tick(self, stamp: float, now: int) -> int:
-        """The tick of the cycle stamped `stamp` s that came at tick `now`; always a later one."""
+    def tick(self, stamp: float, now: int, rate: float = 1.0) -> int:
+        """The tick of the cycle stamped `stamp` s that came at tick `now`; always a later one.
+
+        rate: how much faster the ticks' clock runs than the device's.
+        """
         if self._last is None:
-            self._last = stamp, max(now, 0)
-            return self._last[1]
+            self._last = stamp, float(max(now, 0))
+            return max(now, 0)
         before, last = self._last
         cycles = max(round((stamp - before) / self._period), 1)
-        tick = last + max(round(cycles * self._period * self._ticks_per_s), 1)
-        off = now - tick
+        exact = last + cycles * self._period * self._ticks_per_s * rate
+        off = now - exact
         if not -self.STEP < off < self.STEP:
-            tick = now
+            exact = now
         elif abs(off) > self.SLACK:
-            tick += 1 if off > 0 else -1
-        tick = max(tick, last + 1)
-        self._last = stamp, tick
-        return tick
+            exact += 1 if off > 0 else -1
+        exact = max(exact, round(last) + 1.0)
+        self._last = stamp, exact
+        return round(exact)

@@ -104,5 +104,6 @@ class Firmware:
         flags = RETRACTING * retracting + BAD_COMMAND * self._bad
         self._bad = False
         values = np.concatenate((theta, x, y))[self._order] * self._per_unit
-        counts = np.clip(np.rint(values), -32768, 32767).astype("<i2").tobytes()
+        np.rint(values, out=values)
+        counts = values.clip(-32768.0, 32767.0, out=values).astype("<i2").tobytes()
         return RawSample(seq, seq * PERIOD_US % _WRAP, self._answers, flags, counts)

@@ -49,6 +49,8 @@ OTHERS_S = 0.05
 """How long a second head may take to give itself away."""
 SILENCE_S: Final = 0.1
 RETRY_S: Final = 0.1
+FAR: Final = 2000
+"""Samples that may be missing, beside twice those of the time that has passed."""
 _WRAP: Final = 2**32
 
 
@@ -175,25 +177,33 @@ class HeadDevice(ABC):
         after an interruption is not the head that was there before.
         """
         ready = self._ready
-        if ready:
-            return ready.popleft()
         deadline = time.monotonic_ns() + int(timeout * 1e9)
-        while True:
-            now = time.monotonic_ns()
-            self._look_after(now)
-            left = max(deadline - now, 0) * 1e-9
-            if self._linked:
-                wait = min(left, SILENCE_S)
-                try:
-                    self._take(self._receive(wait))
-                except OSError:
-                    self._unlink()
-            elif left > 0.0:
-                time.sleep(min(left, 0.01))
-            if ready:
-                return ready.popleft()
-            if time.monotonic_ns() >= deadline:
+        while not ready:
+            left = max(deadline - time.monotonic_ns(), 0) * 1e-9
+            self._listen(min(left, SILENCE_S))
+            if not ready and time.monotonic_ns() >= deadline:
                 return None
+        return ready.popleft()
+
+    def poll(self, timeout: float = 0.0) -> list[Reading]:
+        """All that one look at the wire brings, waiting for it no longer than `timeout` s.
+
+        What is left comes with the next. Raises as `read` does.
+        """
+        self._listen(timeout)
+        found = list(self._ready)
+        self._ready.clear()
+        return found
+
+    def _listen(self, timeout: float) -> None:
+        self._look_after(time.monotonic_ns())
+        if self._linked:
+            try:
+                self._take(self._receive(timeout))
+            except OSError:
+                self._unlink()
+        elif timeout > 0.0:
+            time.sleep(min(timeout, 0.01))
 
     def write(self, tick: int, command: Float32s) -> bool:
         """Send the drives their set-points float32[18], rad, that answer the sample of `tick`.
@@ -202,7 +212,7 @@ class HeadDevice(ABC):
         DeviceLimit before anything is sent.
         """
         self.limits.check(tick, command)
-        counts = np.rint(command / np.float32(self.info.command_scale)).astype("<i2")
+        counts = np.rint(command / self._command_scale).astype("<i2")
         if not self._linked or not self._try_to_send(Command(tick % _WRAP, counts.tobytes())):
             self.counters.unsent += 1
             return False
@@ -266,6 +276,7 @@ class HeadDevice(ABC):
 
     def _adopt(self, hello: Hello) -> None:
         self.info = hello
+        self._command_scale = np.float32(hello.command_scale)
         where = {(c.kind, c.whisker): k for k, c in enumerate(hello.channels)}
         kinds = (protocol.THETA, protocol.X, protocol.Y)
         order = [where[kind, i] for kind in kinds for i in range(WHISKERS)]
@@ -347,7 +358,7 @@ class HeadDevice(ABC):
             self.clock.forget()
         else:
             steps = (seq - self._seq) % _WRAP
-            if steps == 0 or steps > 2000 + 2 * self._elapsed(host_ns):
+            if steps == 0 or (steps > FAR and steps > FAR + 2 * self._elapsed(host_ns)):
                 self.counters.strays += 1
                 self._astray = steps != 0
                 if steps and host_ns - self._asked_ns > ASK_S * 1e9:

@@ -53,20 +53,20 @@ class HeadEmulator(ABC):
         )
 
     def run(self, url: str) -> None:
-        """Until the standard input ends."""
-        self.orders.ready(url, self.ear.port)
-        stdin = sys.stdin.fileno()
-        while True:
-            wires = [fd for fd in (self.wire(),) if fd >= 0]
-            readable, _, _ = select.select([stdin, *wires], [], [], self.clock.wait())
-            if stdin in readable and not self.orders.take():
-                return
-            self.turn(heard=not wires or wires[0] in readable)
+        """Until the standard input ends.
 
-    def turn(self, *, heard: bool = True) -> None:
+        What comes down the wire waits for the next tick, when the drives would take it anyhow.
+        """
+        self.orders.ready(url, self.ear.port)
+        stdin = [sys.stdin]
+        while True:
+            if select.select(stdin, (), (), self.clock.wait())[0] and not self.orders.take():
+                return
+            self.turn()
+
+    def turn(self) -> None:
         """Hear what came down, live through the ticks that are due."""
-        if heard:
-            self.take()
+        self.take()
         for _ in range(self.clock.due()):
             sample = self.firmware.sample()
             if sample is not None:
@@ -88,10 +88,6 @@ class HeadEmulator(ABC):
     @abstractmethod
     def more_orders(self) -> dict[str, Callable[..., object]]:
         """Orders that this wire understands too."""
-
-    @abstractmethod
-    def wire(self) -> int:
-        """The file descriptor to listen on, -1 while there is none."""
 
     @abstractmethod
     def take(self) -> None:

@@ -53,9 +53,9 @@ class HeadLimits:
                 f"head command, tick {tick}: expected float32[{WHISKERS}], "
                 f"found {command.dtype}{list(command.shape)}"
             )
-        inside = (command >= self.low) & (command <= self.high)
-        if not inside.all():
-            i = int(inside.argmin())
+        # NaN becomes a bound here, so that it is none of what is inside
+        if np.fmin(np.fmax(command, self.low), self.high).tobytes() != command.tobytes():
+            i = int(((command >= self.low) & (command <= self.high)).argmin())
             raise DeviceLimit(
                 f"head command, tick {tick}: {whisker_name(i)}: expected {self.low[i]:.4g} to "
                 f"{self.high[i]:.4g} rad, found {command[i]:.6g}"
@@ -115,7 +115,11 @@ class ArmLimits:
                 )
 
     def check_rates(self, where: str, velocity: Pose, before: Pose, seconds: float) -> None:
-        """Raises DeviceLimit when speed, or its change since `before`, is too large."""
+        """Raises DeviceLimit when speed, or its change since `before`, is too large.
+
+        Both are means over the time between set-points; seconds: from the middle of one to that of
+        the other.
+        """
         change = [(v - b) / seconds for v, b in zip(velocity, before, strict=True)]
         rates = (
             ("speed", math.hypot(*velocity[:3]), self.speed, "m/s"),
@@ -171,6 +175,7 @@ class Follower:
         self.velocity: Pose = (0.0, 0.0, 0.0, 0.0)
         self.q = q
         self._first = True
+        self._took = period
 
     def follow(self, where: str, pose: Pose, seconds: float | None = None) -> None:
         """Take one set-point, `seconds` of the path (default: a period) after the one before.
@@ -191,14 +196,14 @@ class Follower:
         vx, vy, vz, turn = (s / period for s in steps)
         velocity = (vx, vy, vz, turn)
         if not self._first and pose != self.pose:
-            limits.check_rates(where, velocity, self.velocity, period)
+            limits.check_rates(where, velocity, self.velocity, 0.5 * (self._took + period))
         q = self.q
         if self.mount is not None and q is not None:
             q = ur10.nearest(self.mount.flange(pose), q)
             if q is None:
                 raise DeviceLimit(f"{where}: expected a pose in reach, found {_text(pose)}")
             limits.check_joints(where, q, self.q or q, math.inf if self._first else period)
-        self.pose, self.q = pose, q
+        self.pose, self.q, self._took = pose, q, period
         self.velocity = (0.0, 0.0, 0.0, 0.0) if self._first else velocity
         self._first = False
 

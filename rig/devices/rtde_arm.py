@@ -13,9 +13,6 @@ from vibrissa.rig.devices.errors import DeviceRefused, DeviceStopped, DeviceUnav
 from vibrissa.rig.devices.limits import ARM, ArmLimits, Pose
 from vibrissa.rig.devices.rtde_link import ENABLE, HALT, POSE, RUNNING, SERVO, STATE, Link
 
-ANSWER_SHARE: Final = 0.625
-"""How long the control link may take for a set-point, as a share of the longest time without any:
-50 ms by default. The median is 0.1 ms."""
 HALT_S: Final = 0.3
 START_S: Final = 15.0
 
@@ -39,7 +36,8 @@ class RtdeArm(ArmDevice):
         self._standby: Link | None = None
         self._q: ur10.Joints | None = None
         self._tilt = 0.0
-        self._answer_s = ANSWER_SHARE * limits.stale_setpoint_ticks * TICK_NS * 1e-9
+        self._answer_s = limits.stale_setpoint_ticks * TICK_NS * 1e-9
+        """How long the control link may take for a set-point: as long as there may be none."""
 
     def fileno(self) -> int:
         return self._listener.fileno() if self._listener is not None else -1

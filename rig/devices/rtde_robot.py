@@ -55,6 +55,7 @@ class Robot:
         self._done: int | None = None
         self._watchdog = math.inf
         self._kicked = 0.0
+        self._measured: tuple[ur10.Joints, ur10.Matrix] | None = None
 
     def play(self) -> None:
         """The control script was uploaded and begins."""
@@ -153,7 +154,9 @@ class Robot:
 
     def tcp(self) -> ur10.Matrix:
         """The nose in the base frame."""
-        return ur10.multiply(ur10.forward(self.q), _shift(self.mount.tool))
+        if self._measured is None or self._measured[0] is not self.q:
+            self._measured = self.q, ur10.multiply(ur10.forward(self.q), _shift(self.mount.tool))
+        return self._measured[1]
 
     def head(self) -> ur10.Pose:
         """The head in the maze frame."""

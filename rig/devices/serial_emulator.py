@@ -99,9 +99,6 @@ class SerialEmulator(HeadEmulator):
         super().normal()
         self.throttle(0.0)
 
-    def wire(self) -> int:
-        return self._master
-
     def take(self) -> None:
         if self._master < 0:
             return

@@ -9,6 +9,7 @@ measuring one. Poses of the controller are (x, y, z, rotation vector).
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -66,12 +67,16 @@ def solutions(flange: Matrix, wrist_3: float = 0.0) -> list[Joints]:
     Closed form of the arm with three parallel axes (shoulder, elbow, wrist 1). Where wrist 3 is
     parallel to them too it may be chosen: `wrist_3`, rad.
     """
+    return [q for branch in _branches(flange, wrist_3) for q in _plane(flange, *branch)]
+
+
+def _branches(flange: Matrix, wrist_3: float) -> Iterator[tuple[float, float, float]]:
+    """Base, wrist 2 and wrist 3 (rad) of the solutions, two of which share each."""
     (nx, ox, ax, px), (ny, oy, ay, py), _ = flange
-    found: list[Joints] = []
     wx, wy = px - D6 * ax, py - D6 * ay
     radius = math.hypot(wx, wy)
     if radius < D4:
-        return found
+        return
     bearing, offset = math.atan2(wy, wx), math.acos(min(D4 / radius, 1.0))
     for q1 in (bearing + offset + math.pi / 2, bearing - offset + math.pi / 2):
         s1, c1 = math.sin(q1), math.cos(q1)
@@ -85,8 +90,7 @@ def solutions(flange: Matrix, wrist_3: float = 0.0) -> list[Joints]:
                 q6 = wrist_3
             else:
                 q6 = math.atan2((-ox * s1 + oy * c1) / s5, (nx * s1 - ny * c1) / s5)
-            found += _plane(flange, q1, q5, q6)
-    return found
+            yield q1, q5, q6
 
 
 def _plane(flange: Matrix, q1: float, q5: float, q6: float) -> list[Joints]:
@@ -121,12 +125,16 @@ def nearest(flange: Matrix, q: Joints) -> Joints | None:
     """The solution nearest to q, its angles continued from q; None out of reach."""
     best: Joints | None = None
     smallest = math.inf
-    for candidate in solutions(flange, q[5]):
-        moved = [math.remainder(c - b, 2 * math.pi) for c, b in zip(candidate, q, strict=True)]
-        largest = max(map(abs, moved))
-        if largest < smallest:
-            a, b, c, d, e, f = (x + m for x, m in zip(q, moved, strict=True))
-            best, smallest = (a, b, c, d, e, f), largest
+    for q1, q5, q6 in _branches(flange, q[5]):
+        known = (q1 - q[0], q5 - q[4], q6 - q[5])
+        if max(abs(math.remainder(d, 2 * math.pi)) for d in known) > smallest:
+            continue  # the other three joints can't make up for that
+        for candidate in _plane(flange, q1, q5, q6):
+            moved = [math.remainder(c - b, 2 * math.pi) for c, b in zip(candidate, q, strict=True)]
+            largest = max(map(abs, moved))
+            if largest < smallest:
+                a, b, c, d, e, f = (x + m for x, m in zip(q, moved, strict=True))
+                best, smallest = (a, b, c, d, e, f), largest
     return best
 
 

@@ -79,10 +79,17 @@ def stepped_head(
 
 
 class MutableArm(VirtualArm):
-    """A virtual arm whose states can be kept from us, while it goes on."""
+    """A virtual arm whose states can be kept from us, while it goes on, and its clock set back."""
 
     mute = False
+    epoch = 0.0
 
     def _next(self, timeout: float) -> ArmReport | None:
         report = super()._next(timeout)
-        return None if self.mute else report
+        if self.mute or report is None:
+            return None
+        return report._replace(stamp=report.stamp - self.epoch)
+
+    def reboot(self) -> None:
+        """Begin a silence after which its clock has started afresh."""
+        self.mute, self.epoch = True, self.report.stamp

@@ -341,6 +341,22 @@ def test_when_the_driver_dies_the_controller_stops_the_arm_by_itself(
         assert float(emulator.ask("travelled")) == pytest.approx(float(travelled), abs=1e-6)
 
 
+def test_a_set_point_may_take_as_long_as_there_may_be_none(
+    real: ArmBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[float] = []
+    with real.make(ArmLimits(stale_ticks=4000, stale_setpoint_ticks=1200, watchdog=0.5)) as arm:
+        assert isinstance(arm, RtdeArm)
+        arm.enable()
+        goal = advance(arm, 10)
+        with monkeypatch.context() as patch:
+            patch.setattr(arm._control, "done", lambda _, timeout: bool(asked.append(timeout)))
+            with pytest.raises(DeviceStopped, match="takes no set-points"):
+                arm.write(1000, goal)
+        assert asked[0] == pytest.approx(0.6)
+        assert arm.state is State.STOPPED
+
+
 @pytest.mark.parametrize(
     ("greeting", "error", "complaint"),
     [

@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 
 from vibrissa.rig.devices.clock import ClockRelation, CycleTicks
 
+TICK_NS = 500_000
+
 
 def test_drift_and_offset_are_found_under_delays_of_milliseconds() -> None:
     clock, rng = ClockRelation(), random.Random(3)
@@ -59,3 +61,29 @@ def test_a_controller_that_reboots_does_not_turn_ticks_back() -> None:
     ticks = [cycles.tick(100 + 0.008 * k, 16 * k) for k in range(50)]
     ticks += [cycles.tick(0.008 * k, 20_000 + 16 * k) for k in range(50)]
     assert all(b > a for a, b in pairwise(ticks)) and ticks[-1] == 20_000 + 16 * 49
+
+
+@pytest.mark.parametrize("head", [-0.1, -0.07, 0.0, 0.07, 0.1])
+@pytest.mark.parametrize("arm", [-0.1, 0.0, 0.1])
+def test_cycles_keep_to_a_clock_that_is_far_off_evenly_once_its_drift_is_known(
+    head: float, arm: float
+) -> None:
+    """The clocks of head and arm run up to 10 % off the host's; both are heard up to 3 ms late."""
+    rng = random.Random(5)
+    late_ns = 3_000_000
+    heads, arms = ClockRelation(), ClockRelation()
+    cycles = CycleTicks(0.008)
+    before = 0
+    for k in range(2500):
+        arm_ns = 8_000_000 * k
+        host_ns = arm_ns * (1 + arm)
+        head_ns = host_ns / (1 + head)
+        arms.see(arm_ns, round(host_ns + rng.random() * late_ns))
+        heads.see(round(head_ns), round(host_ns + rng.random() * late_ns))
+        if arm_ns < 2e9:
+            continue
+        now = round((head_ns + rng.random() * late_ns) / TICK_NS)
+        tick = cycles.tick(arm_ns * 1e-9, now, (1 + arms.drift) / (1 + heads.drift))
+        assert abs(tick - head_ns / TICK_NS) <= 16
+        assert not before or abs(tick - before - 16 * (1 + arm) / (1 + head)) <= 2
+        before = tick

@@ -49,6 +49,29 @@ def test_a_path_beyond_a_limit_is_refused_by_name(path: list[Pose], complaint: s
     assert "\n" not in str(caught.value) and "arm path, " in str(caught.value)
 
 
+@given(st.lists(st.integers(4, 160), min_size=3, max_size=12), st.sampled_from([1.9, 2.1]))
+def test_acceleration_is_judged_alike_however_unevenly_set_points_come(
+    ticks: list[int], acceleration: float
+) -> None:
+    follower = Follower(ARM, PERIOD, START)
+    follower.follow("set-point", START)
+    at = 0.0
+    passed = True
+    for number in ticks:
+        seconds = number / 2000
+        at += seconds
+        x = START[0] + 0.5 * acceleration * at * at
+        if acceleration * at > ARM.speed:
+            return
+        try:
+            follower.follow("set-point", (x, *START[1:]), seconds)
+        except DeviceLimit as error:
+            assert " acceleration: expected at most 2.0" in str(error)
+            passed = False
+            break
+    assert passed == (acceleration < ARM.acceleration)
+
+
 coordinate = st.floats(-0.5, 1.5) | st.floats(allow_nan=True, allow_infinity=True)
 
 

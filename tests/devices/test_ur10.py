@@ -40,6 +40,23 @@ def test_every_solution_leads_to_the_pose_and_one_is_where_it_came_from(q: ur10.
         assert near is not None and near == pytest.approx(q, abs=1e-5)
 
 
+@given(joints, joints)
+def test_the_nearest_is_the_one_whose_joint_that_moves_most_moves_least(
+    there: ur10.Joints, q: ur10.Joints
+) -> None:
+    def largest(solution: ur10.Joints) -> float:
+        turns = zip(solution, q, strict=True)
+        return max(abs(math.remainder(a - b, 2 * math.pi)) for a, b in turns)
+
+    t = ur10.forward(there)
+    near = ur10.nearest(t, q)
+    found = ur10.solutions(t, q[5])
+    if near is None:
+        assert not found  # some poses are reached with one turn of wrist 3 only
+    else:
+        assert largest(near) == pytest.approx(min(map(largest, found)), abs=1e-12)
+
+
 @given(joints)
 def test_rotation_vectors_describe_the_same_turn(q: ur10.Joints) -> None:
     t = ur10.forward(q)

@@ -182,6 +182,7 @@ class ArmWorld(World):
         super().__init__(patch, experiment, "arm-device")
         self.goal: Pose = make_path(experiment).pose(0)
         self.speed = 0.0  # m/s
+        self.drift = 0.0  # of the head's clock
         self.guiding = self.news = True
 
         def make(_url: str, *, start: Pose, limits: ArmLimits) -> MutableArm:
@@ -195,7 +196,8 @@ class ArmWorld(World):
         super().live()
         tick = self.bus.tick
         if self.news and tick >= 0 and tick % 100 == 0:
-            told = DeviceClock("head", tick, tick * TICK_NS, tick * TICK_NS, 0.0)
+            sample = round(tick / (1 + self.drift))
+            told = DeviceClock("head", sample, sample * TICK_NS, tick * TICK_NS, self.drift)
             self.bus.tell("rig.clock", "head-device", told)
         fresh = self.bus.said[self._answered :]
         self._answered = len(self.bus.said)
@@ -206,7 +208,7 @@ class ArmWorld(World):
     def guide(self, tick: int) -> None:
         """The set-point that answers the state of a tick."""
         x, y, z, yaw = self.goal
-        self.speed = min(self.speed + 0.008, 0.05) if self.bus.events("enabled") else 0.0
+        self.speed = min(self.speed + 0.004, 0.05) if self.bus.events("enabled") else 0.0
         self.goal = x + self.speed * 0.008, y, z, yaw
         self.bus.tell("arm.setpoint", "arm", ArmSetpoint(tick, np.array(self.goal)))
 

@@ -177,9 +177,28 @@ def test_an_arm_that_is_well_is_enabled_at_tick_0_and_moves_as_it_is_told(
     assert world.arm.counters.refused == 0 and world.arm.counters.setpoints > 200
 
 
+@pytest.mark.parametrize("drift", [-0.1, 0.1])
+def test_an_arm_keeps_to_the_ticks_of_a_head_whose_clock_is_far_off(
+    drift: float, monkeypatch: Patch, tmp_path: Path
+) -> None:
+    world = ArmWorld(monkeypatch, tmp_path)
+    world.drift = drift
+    bus, retracts, _ = ran(world)
+    assert not retracts and world.arm.counters.refused == 0
+    ticks = [r.tick for r in bus.of("rig.arm")]
+    cycle = 16 / (1 + drift)
+    assert all(abs(b - a - cycle) <= 2 for a, b in pairwise(ticks))
+    assert ticks[-1] == pytest.approx(len(ticks) * cycle, abs=3 * cycle)
+
+
 STOPPING: dict[str, tuple[Callable[[ArmWorld], object], str, int]] = {
     "a stall": (
         lambda w: setattr(w.arm, "mute", True),
+        f"no state, so no set-point for {ARM.stale_setpoint_ticks} ticks",
+        ARM.stale_setpoint_ticks,
+    ),
+    "a reboot of the controller": (
+        lambda w: w.arm.reboot(),
         f"no state, so no set-point for {ARM.stale_setpoint_ticks} ticks",
         ARM.stale_setpoint_ticks,
     ),
@@ -270,6 +289,25 @@ def test_a_stop_that_is_said_while_the_arm_is_enabled_wins(
     assert not retracts and not bus.events("enabled")
     assert world.arm.counters.setpoints == 0
     assert all(speed == 0.0 for _, speed in speeds)
+
+
+def test_states_that_waited_while_the_arm_was_enabled_are_not_answered(
+    monkeypatch: Patch, tmp_path: Path
+) -> None:
+    world = ArmWorld(monkeypatch, tmp_path)
+    world.orders[-100] = lambda: setattr(world.arm, "_start_motion", lambda: world.clock.sleep(0.2))
+    said_at: list[int] = []
+    publish = world.bus.publish
+
+    def noting(frame: bytes) -> None:
+        publish(frame)
+        if world.bus.said[-1].topic == "rig.arm":
+            said_at.append(world.bus.tick)
+
+    monkeypatch.setattr(world.bus, "publish", noting)
+    bus, retracts, _ = ran(world)
+    assert not retracts and bus.events("enabled")
+    assert said_at[0] >= 400 and all(b - a >= 15 for a, b in pairwise(said_at))
 
 
 def test_a_retract_of_the_heads_process_stops_the_arm_and_later_set_points_are_ignored(

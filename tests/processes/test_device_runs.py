@@ -43,6 +43,7 @@ pytestmark = pytest.mark.live
 FILE = """\
 [run]
 duration = {duration}
+together = [["sampler", "whisk"]]
 [whisk]
 period = 1.0
 calibration_cycles = 1

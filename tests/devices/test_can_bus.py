@@ -1,0 +1,57 @@
+"""The buses of datagrams: who hears what."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+
+import can
+import pytest
+
+from vibrissa.rig.devices.can_bus import close_bus, open_bus, send_frame
+from vibrissa.rig.devices.can_layout import FROM_HEAD, FROM_HOST
+from vibrissa.rig.devices.errors import DeviceUnavailable
+
+STRANGER = 0x123
+
+
+@pytest.fixture(params=["loopback", "udp_multicast"])
+def members(request: pytest.FixtureRequest) -> Iterator[dict[str, can.BusABC]]:
+    """A host, a head, and one that listens to everything."""
+    channel = "239.74.163.77"
+    if request.param == "loopback":
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind(("127.255.255.255", 0))
+            channel = str(probe.getsockname()[1])
+    found: dict[str, can.BusABC] = {}
+    try:
+        for name, own in (("host", FROM_HOST), ("head", FROM_HEAD), ("anybody", ())):
+            found[name] = open_bus(name, request.param, channel, own)
+    except DeviceUnavailable as error:
+        pytest.skip(str(error))
+    yield found
+    for bus in found.values():
+        close_bus(bus)
+
+
+def heard(bus: can.BusABC) -> list[tuple[int, bytes]]:
+    """What comes until nothing comes."""
+    found = []
+    while (message := bus.recv(0.1)) is not None:
+        found.append((message.arbitration_id, bytes(message.data)))
+    return found
+
+
+def test_members_hear_everything_but_what_only_they_say(members: dict[str, can.BusABC]) -> None:
+    said = [(i, bytes((i & 0xFF,)) * 8) for i in (*FROM_HOST, *FROM_HEAD, STRANGER)]
+    for identifier, data in said:
+        send_frame(members["anybody"], identifier, data)
+    for name, own in (("host", FROM_HOST), ("head", FROM_HEAD)):
+        assert heard(members[name]) == [frame for frame in said if frame[0] not in own]
+
+
+def test_an_own_frame_does_not_wake_its_sender(members: dict[str, can.BusABC]) -> None:
+    for identifier in FROM_HOST:
+        send_frame(members["host"], identifier, bytes(8))
+    assert [identifier for identifier, _ in heard(members["head"])] == list(FROM_HOST)
+    assert heard(members["host"]) == []
