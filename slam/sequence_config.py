@@ -69,7 +69,7 @@ class SequenceConfig:
     loop_place: float = 0.015
     loop_heading: float = 0.1
     robust: float = 9.0
-    doubt: float = 2.0
+    doubt: float = 1.0
     compass: bool = False
     compass_wall: float = 0.01
     odometer: OdometerNoise = field(default_factory=OdometerNoise)

@@ -45,7 +45,7 @@ def bench(out: Path, seconds: float, on_progress: OnProgress, *, quick: bool = F
 
     quick: one short data set without costs by size, to see that it works.
     """
-    wanted = [work for work in works(SEEDS, quick) if work.group == "plain"]
+    wanted = works(SEEDS, quick, ["plain"])
     wanted = wanted[:1] if quick else wanted
     rows = [row for row in ROWS if row.name in (*TOUCH, *CONTROLS)]
     runs: list[dict[str, Any]] = []

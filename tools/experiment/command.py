@@ -28,6 +28,10 @@ def experiment(
     quick: Annotated[
         bool, typer.Option("--quick", help="A fast head and fewer circuits: a look, no claim.")
     ] = False,
+    group: Annotated[
+        list[str] | None,
+        typer.Option(help="slam: only this group of data sets; may be repeated. [default: all]"),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Reproduce the paper (open loop against RCP, max angle against contact angle, with controls),
@@ -39,7 +43,7 @@ def experiment(
         raise typer.BadParameter(f"no experiment {name!r}; there are `paper` and `slam`")
     folder = out or Path("runs") / name
     if name == "slam":
-        _slam(seeds, quick, jobs or len(os.sched_getaffinity(0)), folder, as_json)
+        _slam(seeds, quick, group or [], jobs or len(os.sched_getaffinity(0)), folder, as_json)
         return
     from vibrissa.tools.experiment.design import NOISE, scale
     from vibrissa.tools.experiment.paper import run_paper
@@ -58,11 +62,15 @@ def experiment(
     console.print(f"{folder / 'report.html'}  {results['timing']['wall_s']:.0f} s")
 
 
-def _slam(seeds: int, quick: bool, jobs: int, out: Path, as_json: bool) -> None:
+def _slam(seeds: int, quick: bool, groups: list[str], jobs: int, out: Path, as_json: bool) -> None:
     from vibrissa.tools.experiment.scores import RELATIONS
     from vibrissa.tools.experiment.slam_report import SHOWN, run_slam
+    from vibrissa.tools.experiment.slam_runs import VARIANTS
 
-    results = run_slam(seeds, quick, jobs, out)
+    for name in groups:
+        if name not in VARIANTS:
+            raise typer.BadParameter(f"no group {name!r}; there are {', '.join(VARIANTS)}")
+    results = run_slam(seeds, quick, groups, jobs, out)
     if as_json:
         print_json(results)
         return

@@ -41,11 +41,13 @@ TICKS: Final = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 SHOWN: Final = ("sequence, batch", "sequence, lag 100", "sequence, past only")
 
 
-def run_slam(seeds: int, quick: bool, jobs: int, out: Path) -> dict[str, Any]:
+def run_slam(
+    seeds: int, quick: bool, groups: Sequence[str], jobs: int, out: Path
+) -> dict[str, Any]:
     """Run what the cache lacks, write results.json, report.md and report.html into `out`."""
     folder = out / "cache"
     folder.mkdir(parents=True, exist_ok=True)
-    wanted = works(seeds, quick)
+    wanted = works(seeds, quick, groups)
     run_all(folder, wanted, jobs)
     runs = [row for work in wanted for row in run_work(folder, work)]
     table = tabulate(runs)

@@ -18,6 +18,12 @@ def test_an_unknown_experiment_is_named_with_those_there_are() -> None:
     assert "'rats'" in result.output and "paper" in result.output
 
 
+def test_an_unknown_group_is_named_with_those_there_are() -> None:
+    result = CliRunner().invoke(app, ["experiment", "slam", "--group", "cats"])
+    assert result.exit_code == 2
+    assert "'cats'" in result.output and "plain" in result.output
+
+
 def test_the_bench_is_found_by_name() -> None:
     assert bench.load("experiment") is bench_experiment.bench
 

@@ -15,7 +15,7 @@ from vibrissa.tools import bench_touch
 from vibrissa.tools.cli import app
 from vibrissa.tools.experiment import slam_report, slam_runs
 from vibrissa.tools.experiment.slam_markdown import interval, ratios
-from vibrissa.tools.experiment.slam_runs import NOISES, ROWS, VARIANTS, works
+from vibrissa.tools.experiment.slam_runs import FIRST_SEED, NOISES, ROWS, VARIANTS, works
 
 
 def test_the_quick_form_writes_its_report_and_goes_on_where_it_stopped(
@@ -54,7 +54,8 @@ def test_every_group_has_fresh_mazes_and_all_noises() -> None:
         mine = [work for work in found if work.group == group]
         assert {work.noise for work in mine} == set(NOISES)
         assert len({work.rig.maze for work in mine}) == len(mine) / len(NOISES)
-    assert min(work.rig.seed for work in found) >= 700
+    assert min(work.rig.seed for work in found) >= FIRST_SEED
+    assert {work.group for work in works(1, False, ["plain"])} == {"plain"}
 
 
 def test_the_table_counts_wins_and_takes_geometric_means() -> None:
