@@ -43,7 +43,7 @@ pytestmark = pytest.mark.live
 FILE = """\
 [run]
 duration = {duration}
-together = {together}
+together = [["sampler", "whisk"]]
 [whisk]
 period = 1.0
 calibration_cycles = 1
@@ -66,13 +66,11 @@ def experiment(
     head: str = "serial:/dev/ttyACM0",
     arm: str = "rtde:192.168.0.10",
     emulate: str = "true",
-    together: str = '[["sampler", "whisk"]]',
     **ticks: int,
 ) -> Experiment:
     path = folder / "devices.toml"
     limits = "\n".join(f"{name}_ticks = {n}" for name, n in (PATIENT | ticks).items())
     fields = {"duration": duration, "head": head, "arm": arm, "emulate": emulate}
-    fields["together"] = together
     path.write_text(FILE.format(**fields, ticks=limits))
     return load_experiment(path)
 
@@ -219,7 +217,7 @@ def rig_of_emulators(folder: Path) -> Iterator[tuple[Experiment, EmulatorProcess
     pose = "--pose=" + ",".join(map(repr, begin))
     host = ["--host", "127.0.2.9"]
     with EmulatorProcess("serial", [pose]) as head, EmulatorProcess("rtde", [*host, pose]) as arm:
-        yield experiment(folder, 60.0, head.url, arm.url, "false", "[]"), arm
+        yield experiment(folder, 60.0, head.url, arm.url, "false"), arm
 
 
 def test_nothing_moves_before_the_operators_start_and_everything_stops_without_a_supervisor(
