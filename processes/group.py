@@ -30,10 +30,20 @@ class Group:
 
     def __init__(self, members: Iterable[tuple[Steps, Iterable[str]]], on_step: OnStep) -> None:
         self._hearers: dict[bytes, list[Steps]] = {}
+        self._members: dict[str, Steps] = {}
         for steps, hears in members:
+            self._members[steps.name] = steps
             for topic in hears:
                 self._hearers.setdefault(topic.encode(), []).append(steps)
         self._on_step = on_step
+
+    def tell(self, name: str, frame: bytes) -> None:
+        """Deliver a frame to one member alone, and everything that follows from it."""
+        steps = self._members[name]
+        step = steps.step(frame)
+        self._on_step(steps, frame, step)
+        for output in step.outputs:
+            self.feed(output)
 
     def feed(self, frame: bytes) -> None:
         """Deliver a frame and everything that follows from it."""

@@ -284,12 +284,14 @@ class Host(Member):
         return CODECS[topic].encode(node, 0, seq, self.t, body)
 
     def _inject(self, kind: str, cause: str) -> None:
-        """Make a decision of the host an input of its nodes, recorded like any other."""
-        for node in self.nodes:
+        """Make a decision of the host an input of its nodes that look out for such, recorded like
+        any other."""
+        for node in (n for n in self.nodes if "host.event" in ROWS[n].hears):
             event = Event(tick=self.t // TICK_NS, kind=kind, node=node, cause=cause)
             frame = self._own_frame("host.event", node, event)
             self._publish_own(frame)
-            self._feed(frame)
+            self._mark, self._said = time.monotonic_ns(), 0
+            self.group.tell(node, frame)
 
 
 def main(name: str, layout: Layout) -> None:

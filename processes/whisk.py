@@ -37,6 +37,7 @@ from vibrissa.processes.config import Experiment
 from vibrissa.processes.controllers import make_controller
 from vibrissa.processes.node import Output
 from vibrissa.processes.results import RunError, one_line
+from vibrissa.rig.devices.limits import HEAD
 
 DISTURBANCE = 0.02
 """Largest distance of the drives' command from the controller's in free whisking, rad."""
@@ -136,7 +137,8 @@ class WhiskNode:
         calibrating = self._calibrator is not None
         if self._calibrator is not None:
             off = np.abs(sample.command - before).max()
-            self._disturbed |= bool(off > DISTURBANCE)
+            unheard = tick - sample.answers >= HEAD.watchdog_ticks  # they retract by themselves
+            self._disturbed |= unheard or bool(off > DISTURBANCE)
             yield from self._calibrate(self._calibrator, sample)
         if (tick + 1) // self._period > self._cycle_start // self._period:  # samples may be lost
             cycle = self._cycle(tick, calibrating)
@@ -212,8 +214,9 @@ class WhiskNode:
         return [
             _fault(
                 tick,
-                f"calibration: given up after {MOST_ATTEMPTS} cycles in which the drives were "
-                f"more than {DISTURBANCE} rad from what was commanded",
+                f"calibration: given up after {MOST_ATTEMPTS} cycles in which the drives were more "
+                f"than {DISTURBANCE} rad from what was commanded, or had heard nothing for "
+                f"{HEAD.watchdog_ticks} ticks",
             )
         ]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -16,6 +17,10 @@ from vibrissa.processes.rebuild import open_log
 from vibrissa.processes.results import RunError, UnusableLogError
 from vibrissa.processes.simulate import make_directory
 from vibrissa.rig.devices.csv import CsvError, Recording, read_csv, write_csv
+from vibrissa.slam.angles import wrap_pi
+
+YAW: Final = 3
+"""Column of a pose x, y, z, yaw."""
 
 
 def of_log(log: Path, csv: Path) -> int:
@@ -46,7 +51,9 @@ def of_log(log: Path, csv: Path) -> int:
         states.sort(key=lambda state: state.tick)
         at = np.array([state.tick for state in states], np.float64)
         poses = np.stack([state.pose for state in states])
+        poses[:, YAW] = np.unwrap(poses[:, YAW])  # the short way round from state to state
         pose = np.stack([np.interp(ticks, at, poses[:, k]) for k in range(4)], axis=1)
+        pose[:, YAW] = [wrap_pi(yaw) for yaw in pose[:, YAW].tolist()]
     theta, x, y = (np.stack([getattr(s, name) for s in found]) for name in ("theta", "x", "y"))
     write_csv(csv, Recording(ticks / TICK_HZ, theta, x, y, pose))
     return len(found)

@@ -151,6 +151,13 @@ def test_the_same_feeds_give_the_same_order_of_steps() -> None:
     assert once() == once() and len(once()) > 100
 
 
+def test_what_is_told_to_one_member_reaches_the_others_only_by_what_it_says() -> None:
+    nodes = {"sampler": Echo("sampler", {"host.event": ["node.event"]}), "arm": Echo("arm", {})}
+    group, order = grouped(nodes, {"sampler": ("host.event",), "arm": ("host.event", "node.event")})
+    group.tell("sampler", event("host.event"))
+    assert order == ["sampler:host.event#0", "arm:node.event#0"]
+
+
 def test_what_nobody_hears_is_no_step() -> None:
     group, order = grouped({"arm": Echo("arm", {})}, {"arm": ("run.event",)})
     group.feed(event("node.event"))

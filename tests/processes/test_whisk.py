@@ -12,6 +12,7 @@ from vibrissa.control.kinematics import paper_head
 from vibrissa.messages.types import HeadSample, Ownership
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.whisk import WhiskNode
+from vibrissa.rig.devices.limits import HEAD
 
 NOISE = 1e-5
 
@@ -27,14 +28,17 @@ class Head(Bench):
         self.outputs: list[tuple[str, Any]] = []
         self.hear("head.owner", "sampler", 0, Ownership(0, "whisk", 0))
 
-    def run(self, ticks: int, touch: float = 0.0, obey: bool = True) -> list[tuple[str, Any]]:
-        """Outputs of some ticks; `touch` is added to the moment of whisker 4."""
+    def run(
+        self, ticks: int, touch: float = 0.0, obey: bool = True, age: int = 1
+    ) -> list[tuple[str, Any]]:
+        """Outputs of some ticks; `touch` is added to the moment of whisker 4, `age` is how many
+        ticks ago the command was given that the drives obey."""
         outputs = []
         for _ in range(ticks):
             self.tick += 1
             x, y = self.noise.normal(0, NOISE, (2, 18)).astype(np.float32)
             y[4] += np.float32(touch)
-            sample = HeadSample(self.tick, self.tick - 1, self.held, x, y, self.held)
+            sample = HeadSample(self.tick, self.tick - age, self.held, x, y, self.held)
             said = self.hear("head.sample", "sampler", self.tick, sample)
             (command,) = of(said, "whisk.command")
             assert command.tick == self.tick and said[0][0] == "whisk.command"
@@ -91,11 +95,12 @@ def test_a_touch_while_calibrating_is_a_fault_that_names_the_whisker(
     assert of(head.outputs, "whisk.calibration") == []
 
 
+@pytest.mark.parametrize("what", [{"obey": False}, {"age": HEAD.watchdog_ticks}])
 def test_a_cycle_in_which_the_drives_did_something_else_does_not_count_for_calibration(
-    head: Head, short: Experiment
+    head: Head, short: Experiment, what: dict[str, Any]
 ) -> None:
     head.run(short.period_ticks // 2)
-    head.run(50, obey=False)
+    head.run(50, **what)
     head.run(short.period_ticks)
     assert of(head.outputs, "whisk.calibration") == []
     outputs = head.run(short.period_ticks)
