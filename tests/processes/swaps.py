@@ -22,6 +22,7 @@ FAULTS = "tests.controllers_for_tests"
 EXPERIMENT = """\
 [run]
 duration = {duration}
+together = {together}
 [whisk]
 period = 0.4
 controller = "{controller}"
@@ -38,15 +39,15 @@ def experiment(
     duration: float,
     swaps: tuple[tuple[int, str], ...] = (),
     controller: str = "open_loop",
+    together: str = "[]",
     **controllers: str,
 ) -> Experiment:
-    """Short cycles, named controllers ("module:Class"), swaps (cycle, name)."""
+    """Short cycles, named controllers ("module:Class"), swaps (cycle, name), groups of nodes."""
     named = "\n".join(f'{name} = "{target}"' for name, target in controllers.items())
     listed = "\n".join(f'[[swap]]\nat_cycle = {cycle}\nto = "{name}"' for cycle, name in swaps)
     path = folder / "experiment.toml"
-    path.write_text(
-        EXPERIMENT.format(duration=duration, controller=controller, controllers=named, swaps=listed)
-    )
+    fields = {"duration": duration, "controller": controller, "together": together}
+    path.write_text(EXPERIMENT.format(**fields, controllers=named, swaps=listed))
     return load_experiment(path)
 
 
