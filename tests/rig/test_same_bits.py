@@ -1,4 +1,7 @@
-"""The simulated rig gives the same bytes on machines of other kinds and with nothing skipped."""
+"""The simulated rig gives the same bytes with other libraries and with nothing skipped.
+
+On a processor of the oldest kind, see tests/processes/test_same_bits.py.
+"""
 
 import os
 import subprocess
@@ -42,10 +45,6 @@ def oldest(request) -> dict[str, str]:
 )
 def test_other_libraries_give_the_same_bytes(here: str, environment: dict[str, str]) -> None:
     assert digest("skip", environment) == here
-
-
-def test_a_processor_of_the_oldest_kind_gives_the_same_bytes(here: str, oldest) -> None:
-    assert digest("skip", {**oldest, **NO_FMA}) == here
 
 
 def test_skipping_nothing_gives_the_same_bytes(here: str) -> None:

@@ -130,6 +130,7 @@ def test_json_has_no_word_for_nan_and_knows_numpy() -> None:
     }
 
 
+@pytest.mark.live
 def test_devices_are_measured_beside_a_virtual_rig(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
