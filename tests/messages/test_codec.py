@@ -315,7 +315,7 @@ def test_one_flipped_bit_gives_a_named_refusal_or_a_message_within_its_limits(to
 @given(st.binary(max_size=200))
 def test_random_bytes_are_refused(garbage: bytes) -> None:
     refusal(DecodeError, decode, garbage)
-    assume(garbage not in {topic.encode() for topic in CODECS})
+    assume(garbage.partition(b"\0")[0] not in {topic.encode() for topic in CODECS})
     refusal(DecodeError, topic_of, garbage + b"\0")
 
 
