@@ -22,7 +22,6 @@ FAULTS = "tests.controllers_for_tests"
 EXPERIMENT = """\
 [run]
 duration = {duration}
-together = {together}
 [whisk]
 period = 0.4
 controller = "{controller}"
@@ -39,15 +38,15 @@ def experiment(
     duration: float,
     swaps: tuple[tuple[int, str], ...] = (),
     controller: str = "open_loop",
-    together: str = "[]",
     **controllers: str,
 ) -> Experiment:
-    """Short cycles, named controllers ("module:Class"), swaps (cycle, name), groups of nodes."""
+    """Short cycles, named controllers ("module:Class"), swaps (cycle, name)."""
     named = "\n".join(f'{name} = "{target}"' for name, target in controllers.items())
     listed = "\n".join(f'[[swap]]\nat_cycle = {cycle}\nto = "{name}"' for cycle, name in swaps)
     path = folder / "experiment.toml"
-    fields = {"duration": duration, "controller": controller, "together": together}
-    path.write_text(EXPERIMENT.format(**fields, controllers=named, swaps=listed))
+    path.write_text(
+        EXPERIMENT.format(duration=duration, controller=controller, controllers=named, swaps=listed)
+    )
     return load_experiment(path)
 
 

@@ -18,6 +18,7 @@ from typing import Any
 
 import pytest
 
+from tests.conftest import needs_room
 from tests.controllers_for_tests import Ailing
 from tests.processes.live import children
 from tests.processes.swaps import Live, events, experiment, faulty, live, owners, samples, swap
@@ -184,14 +185,9 @@ def swap_or_skip(client: Any, name: str) -> str:
         raise
 
 
+@needs_room
 def test_a_slot_is_scheduled_by_what_it_has_and_killed_within_its_ticks(tmp_path: Path) -> None:
-    made = experiment(
-        tmp_path,
-        duration=300.0,
-        swaps=((10**6, "forger"),),
-        together='[["rig", "sampler", "whisk"], ["arm", "slam"]]',  # room for the newcomer
-        forger=faulty("Forger"),
-    )
+    made = experiment(tmp_path, duration=300.0, swaps=((10**6, "forger"),), forger=faulty("Forger"))
     out = tmp_path / "run"
     with live(made, out) as run, run.client() as client:
         run.told("registered", "whisk.1#0")
