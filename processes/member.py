@@ -42,10 +42,6 @@ class Member(ABC):
         self.layout = layout
         self.missing = realtime.prepare(priority, cores)
         self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        if priority and "SCHED_FIFO" not in self.missing:
-            # its thread would wait until ours sleeps, instead of sending while we go on
-            self.context.set(zmq.THREAD_SCHED_POLICY, os.SCHED_FIFO)
-            self.context.set(zmq.THREAD_PRIORITY, priority + 1)
         self.control = ControlLine(self.context, layout.endpoints["control"], name)
         self.control.say("hello", pid=os.getpid(), missing=self.missing)
         self.port = ZmqPort(

@@ -62,8 +62,8 @@ def set_fifo(priority: int) -> bool:
 
 
 def set_threads(priority: int, cores: set[int]) -> None:
-    """Run all threads of this process under SCHED_FIFO, those of sockets one above the main one,
-    or with priority 0 as favoured others, on some cores.
+    """Run all threads of this process under SCHED_FIFO, or with priority 0 as favoured others, on
+    some cores.
 
     A controller in shadow that can't keep up would, under SCHED_FIFO, use up what the kernel allows
     all such processes of a core together, and have the reflex loop suspended for it.
@@ -73,8 +73,7 @@ def set_threads(priority: int, cores: set[int]) -> None:
         with contextlib.suppress(OSError):
             os.sched_setaffinity(thread, cores)
             if priority:
-                above = thread != os.getpid()  # sockets are served while the main thread goes on
-                os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority + above))
+                os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
             else:
                 os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
                 os.setpriority(os.PRIO_PROCESS, thread, SHADOW_NICE)

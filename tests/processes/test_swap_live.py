@@ -227,7 +227,7 @@ def scheduled_as_told(run: Live, client: Any) -> None:
     def promoted() -> bool:
         return all(
             os.sched_getscheduler(t) == os.SCHED_FIFO
-            and os.sched_getparam(t).sched_priority == SLOTS[slot].priority + (t != pid)
+            and os.sched_getparam(t).sched_priority == SLOTS[slot].priority
             for t in threads
         )
 
