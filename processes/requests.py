@@ -261,7 +261,9 @@ class Requests:
             accepted, text = yield from self._answer(number)
             if accepted:
                 break
-            if not text.startswith(WORTH_RETRYING) or self._run.tick > deadline:
+            missed = at_cycle and text.startswith("in the past")  # the next one is asked for
+            hopeless = not (missed or text.startswith(WORTH_RETRYING))
+            if hopeless or self._run.tick > deadline:
                 raise RunError(f"swap to {self.slots.get(slot, slot)} refused: {text}")
             yield from self._prepared(slot)
         accepted, text = yield from self._switched(number, at)

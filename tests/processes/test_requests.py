@@ -125,6 +125,21 @@ def test_a_starved_newcomer_is_prepared_before_it_is_asked_for_again(
     assert desk.commanded[desk.tick] == ["whisk.1"]
 
 
+def test_a_cycle_that_was_missed_on_the_way_is_followed_by_the_next(
+    experiment: Experiment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    desk = Desk(experiment)
+    desk.ask("load", name="rcp")
+    desk.run(100)
+    asked = iter([desk.tick - 1, 300])
+    monkeypatch.setattr(desk.requests, "_next_cycle", lambda: next(asked))
+    answers = desk.ask("swap", name="rcp", when="cycle")
+    desk.run(250)
+    ((accepted, text),) = answers
+    assert accepted and "switched at tick 300" in text
+    one_owner(desk)
+
+
 def test_a_newcomer_that_is_late_even_when_prepared_is_refused(experiment: Experiment) -> None:
     desk = Desk(experiment)
     desk.ask("load", name="rcp")
