@@ -134,7 +134,7 @@ PROCESSES: Final[dict[str, Process]] = {
             ),
             pacing="drain",
             priority=0,
-            silence=5.0,
+            silence=60.0,  # the map of a long run takes its time
         ),
     )
 }
@@ -155,7 +155,7 @@ SLAM_SLOTS: Final[dict[str, Process]] = {
         says=("slam.view", "slam.pose", "slam.map", "eval.metrics", "node.answer", "node.event"),
         pacing="drain",
         priority=0,
-        silence=5.0,
+        silence=60.0,  # the map of a long run takes its time
     )
     for name in (f"slam.{number}" for number in range(1, 4))
 }

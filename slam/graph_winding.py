@@ -16,7 +16,9 @@ from vibrissa.slam.graph import Floats, Graph, GraphParams, Ints, Solution, opti
 from vibrissa.slam.graph_start import start_values
 
 MOST_DOUBTS: Final = 6
-"""Loops whose whole turns are tried the other way, each at the price of one optimisation."""
+"""Loops whose whole turns are tried the other way, each at the price of one optimisation ..."""
+MOST_NODES: Final = 24_000
+"""... of the whole graph: poses that all these tries together may solve for."""
 
 
 def solve_unwound(
@@ -37,7 +39,7 @@ def solve_unwound(
     best, surprise = _solve(first, steps, loops, facing, params, other)
     tried = 0
     done = -1
-    while tried < MOST_DOUBTS:
+    while tried < min(MOST_DOUBTS, MOST_NODES // (len(steps) + 1)):
         later = np.flatnonzero(np.abs(surprise[done + 1 :]) > doubt)
         if len(later) == 0:
             break
