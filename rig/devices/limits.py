@@ -53,9 +53,12 @@ class HeadLimits:
                 f"head command, tick {tick}: expected float32[{WHISKERS}], "
                 f"found {command.dtype}{list(command.shape)}"
             )
-        # NaN becomes a bound here, so that it is none of what is inside
-        if np.fmin(np.fmax(command, self.low), self.high).tobytes() != command.tobytes():
-            i = int(((command >= self.low) & (command <= self.high)).argmin())
+        # quick; bytes differ of NaN, which becomes a bound here, and of -0 at a bound of 0
+        if np.fmin(np.fmax(command, self.low), self.high).tobytes() == command.tobytes():
+            return
+        inside = (command >= self.low) & (command <= self.high)
+        if not inside.all():
+            i = int(inside.argmin())
             raise DeviceLimit(
                 f"head command, tick {tick}: {whisker_name(i)}: expected {self.low[i]:.4g} to "
                 f"{self.high[i]:.4g} rad, found {command[i]:.6g}"

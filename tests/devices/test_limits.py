@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from vibrissa.rig.devices.errors import DeviceLimit
-from vibrissa.rig.devices.limits import ARM, HEAD, Follower, Pose
+from vibrissa.rig.devices.limits import ARM, HEAD, Follower, HeadLimits, Pose
 from vibrissa.rig.plant import WATCHDOG_TICKS
 
 START: Pose = (0.63, 0.09, 0.177, 0.0)
@@ -47,6 +48,13 @@ def test_a_path_beyond_a_limit_is_refused_by_name(path: list[Pose], complaint: s
     with pytest.raises(DeviceLimit, match=complaint) as caught:
         Follower(ARM, PERIOD, START).check_path(path)
     assert "\n" not in str(caught.value) and "arm path, " in str(caught.value)
+
+
+def test_a_drive_at_its_bound_is_inside_whatever_the_sign_of_zero() -> None:
+    limits = HeadLimits(low=np.zeros(18, np.float32))
+    limits.check(1, np.full(18, -0.0, np.float32))
+    with pytest.raises(DeviceLimit, match="found nan"):
+        limits.check(1, np.array([*np.zeros(17), np.nan], np.float32))
 
 
 @given(st.lists(st.integers(4, 160), min_size=3, max_size=12), st.sampled_from([1.9, 2.1]))
