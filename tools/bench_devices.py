@@ -10,7 +10,6 @@ all three: emulators take the place of hardware, and of its cores.
 from __future__ import annotations
 
 import math
-import os
 import time
 from pathlib import Path
 from typing import Any, Final
@@ -30,13 +29,12 @@ from vibrissa.rig.devices.errors import DeviceUnavailable
 from vibrissa.rig.devices.framing import FrameParser, frame
 from vibrissa.rig.devices.protocol import RawSample, pack_from_head, unpack_from_head
 from vibrissa.tools.bench import Bench, Target
+from vibrissa.tools.machine import with_room
 from vibrissa.tools.run import next_directory
 
 MULTICAST: Final = "239.74.163.19"
 """A group of its own, so that a bench hears no other program's frames."""
 STREAM_HZ: Final = 2000
-ROOM: Final = 4
-"""Cores from which on every node has a process of its own."""
 QUICK_S: Final = 3.0
 
 
@@ -57,9 +55,7 @@ def rigs() -> dict[str, Rig]:
 def bench(out: Path, duration: float, on_progress: OnProgress, *, quick: bool = False) -> Bench:
     """Measure; the runs are kept in `out`. quick: three seconds of each."""
     experiment = load_experiment(duration=min(duration, QUICK_S) if quick else duration)
-    if len(os.sched_getaffinity(0)) < ROOM:
-        close = experiment.run.model_copy(update={"together": [["sampler", "whisk"]]})
-        experiment = experiment.model_copy(update={"run": close})
+    experiment = with_room(experiment, [["sampler", "whisk"]])
     rows = []
     for name, rig in rigs().items():
         asked = experiment.model_copy(update={"rig": rig})

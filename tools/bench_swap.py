@@ -37,7 +37,7 @@ from vibrissa.processes.supervisor import Supervisor
 from vibrissa.processes.verify import verify
 from vibrissa.tools.bench import Bench, Target
 from vibrissa.tools.floors import PRIORITY
-from vibrissa.tools.machine import ROOMY
+from vibrissa.tools.machine import with_room
 from vibrissa.tools.run import next_directory
 
 if TYPE_CHECKING:
@@ -66,9 +66,7 @@ LOOP_S: Final = 10.0
 def bench(out: Path, duration: float, on_progress: OnProgress, swaps: int = SWAPS) -> Bench:
     """Measure; the run is kept in `out`. `duration` is how long it goes on without swaps, s."""
     experiment = load_experiment(duration=LONGEST_S, controller=PAIR[0])
-    if len(os.sched_getaffinity(0)) < ROOMY:
-        together = experiment.run.model_copy(update={"together": TOGETHER})
-        experiment = experiment.model_copy(update={"run": together})
+    experiment = with_room(experiment, TOGETHER)
     folder = next_directory("swap", out)
     supervisor = Supervisor(experiment, folder, lambda _progress: None)
     operator = Operator(supervisor, folder, min(duration, QUIET_S), swaps, on_progress)

@@ -9,6 +9,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
 
+from vibrissa.processes.config import Experiment
+
 LIBRARIES: Final = (
     "numpy",
     "numba",
@@ -27,7 +29,16 @@ LIBRARIES: Final = (
 
 
 ROOMY: Final = 4
-"""Cores from which on nodes of a live run and newcomers have room in processes of their own."""
+"""Cores from which on nodes of a live run, newcomers and emulators have room in processes of their
+own."""
+
+
+def with_room(experiment: Experiment, together: list[list[str]]) -> Experiment:
+    """The experiment, these nodes sharing processes on a machine of fewer than ROOMY cores."""
+    if len(os.sched_getaffinity(0)) >= ROOMY:
+        return experiment
+    run = experiment.run.model_copy(update={"together": together})
+    return experiment.model_copy(update={"run": run})
 
 
 def machine() -> dict[str, Any]:
