@@ -8,6 +8,7 @@ process. The check costs about a microsecond a frame; what is refused is counted
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from typing import Final
 
 from vibrissa.messages.codec import header, stream_of
@@ -23,10 +24,12 @@ listened to, so that a flood costs the loop little before its source is ended.""
 class Gate:
     """Admits frames; a stream is heard from its first frame on without repeats, gaps or forgeries.
 
-    limited: whether slots may say no more than `RATE_HZ`.
+    own: nodes of this very process, which hear each other in memory; limited: whether slots may say
+    no more than `RATE_HZ`.
     """
 
-    def __init__(self, *, limited: bool = True) -> None:
+    def __init__(self, own: Iterable[str] = (), *, limited: bool = True) -> None:
+        self._own = frozenset(own)
         self._limited = limited
         self._next: dict[bytes, int] = {}
         self._credit: dict[bytes, tuple[float, int]] = {}
@@ -39,6 +42,10 @@ class Gate:
             stream, seq = stream_of(frame)
             expected = self._next.get(stream)
             if expected is None:
+                source = header(frame)[1]
+                if source in self._own:
+                    self.refuse(source, f"expected no {_title(stream)} from the bus, found #{seq}")
+                    return False
                 self._meet(frame, stream)
             elif seq != expected:
                 source = header(frame)[1]

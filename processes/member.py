@@ -51,7 +51,7 @@ class Member(ABC):
             layout.connections(name),
             bundled=layout.bundled(name),
         )
-        self.gate = Gate()
+        self.gate = Gate(own=layout.hosts.get(name, [name]))
         self.sent: collections.Counter[str] = collections.Counter()
         self.t0 = 0
         self.stopping = False

@@ -36,6 +36,15 @@ def test_somebody_elses_name_does_not_disturb_its_owner() -> None:
     assert gate.admits(command("whisk", 500))
 
 
+def test_what_runs_in_this_process_is_not_heard_from_the_bus() -> None:
+    gate = Gate(own=["sampler", "whisk"])
+    assert not gate.admits(command("whisk", 0))
+    assert gate.admits(command("whisk.1", 0))
+    assert gate.take_refused() == {
+        "whisk": (1, "expected no whisk.command whisk from the bus, found #0")
+    }
+
+
 def test_streams_are_told_apart_by_topic_source_and_epoch() -> None:
     gate = Gate()
     assert gate.admits(command("whisk", 3))

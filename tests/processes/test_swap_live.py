@@ -18,7 +18,6 @@ from typing import Any
 
 import pytest
 
-from tests.conftest import needs_room
 from tests.controllers_for_tests import Ailing
 from tests.processes.live import children
 from tests.processes.swaps import Live, events, experiment, faulty, live, owners, samples, swap
@@ -29,6 +28,7 @@ from vibrissa.processes.client import RefusedError
 from vibrissa.processes.realtime import SHADOW_NICE, privileges
 from vibrissa.processes.table import SLOTS
 from vibrissa.processes.verify import verify
+from vibrissa.tools.machine import with_room
 
 pytestmark = pytest.mark.live
 
@@ -185,9 +185,9 @@ def swap_or_skip(client: Any, name: str) -> str:
         raise
 
 
-@needs_room
 def test_a_slot_is_scheduled_by_what_it_has_and_killed_within_its_ticks(tmp_path: Path) -> None:
     made = experiment(tmp_path, duration=300.0, swaps=((10**6, "forger"),), forger=faulty("Forger"))
+    made = with_room(made, [["rig", "sampler", "whisk"], ["arm", "slam"]])
     out = tmp_path / "run"
     with live(made, out) as run, run.client() as client:
         run.told("registered", "whisk.1#0")
