@@ -70,13 +70,13 @@ class ArmPump(Pump):
 
     def turn(self) -> None:
         wire = self._arm.fileno()
-        if wire >= 0:
-            self.port.wait(wire, WAIT_S)
+        said = self.port.wait(wire, WAIT_S) if wire >= 0 else True
         report = self._arm.read(0 if wire >= 0 else VIRTUAL_WAIT_S)
         while report is not None:
             self._moved(report)
             report = self._arm.read(0)
-        self.hear()
+        if said:
+            self.hear()
         if self._asked and time.monotonic_ns() >= self.t0:
             self._start()
         self.look(self.now)

@@ -74,11 +74,11 @@ class HeadPump(Pump):
 
     def turn(self) -> None:
         wire = self._head.fileno()
-        if wire >= 0:
-            self.port.wait(wire, WAIT_S)
+        said = self.port.wait(wire, WAIT_S) if wire >= 0 else True
         for reading in self._head.poll(0.0 if wire >= 0 else VIRTUAL_WAIT_S):
             self._sampled(reading)
-        self.hear()
+        if said:
+            self.hear()
         if not self.done:
             self.look(self.now)
 

@@ -23,6 +23,12 @@ BITRATE, DATA_BITRATE = 1_000_000, 5_000_000
 ERROR_ID: Final = -1
 """Stands for a frame that the controller found to be damaged."""
 _EVERYBODY: Final = "127.255.255.255"
+_MULTICAST_PORT: Final = 43113
+"""That of python-can."""
+_DATA: Final = b"\xa4data\xc4"
+"""msgpack: a name of four letters, and bytes; how many is the byte behind it."""
+_FORMS: Final = 64
+"""Of frames that are known at sight."""
 _HEADER = struct.Struct("<I")
 _KEEP: Final = 1 << 22
 _SO_RCVBUFFORCE: Final = 33
@@ -89,38 +95,67 @@ class LoopbackBus(can.BusABC):
 
 
 class MulticastBus(UdpMulticastBus):
-    """python-can's bus without what only its messages need: time stamps, checks, and one each."""
+    """python-can's bus without what only its messages need: time stamps, checks, and one each.
+
+    All frames of one identifier and size are packed alike but for their data, so they are packed,
+    and known again, by what stands before and behind it; any other frame is python-can's to read.
+    """
 
     def __init__(self, channel: str) -> None:
-        super().__init__(channel, fd=True, hop_limit=0)
-        self._in = socket.socket(fileno=os.dup(self.fileno()))
-        self._message = _message(0, b"")
+        super().__init__(channel, port=_MULTICAST_PORT, fd=True, hop_limit=0)
+        self._to = (channel, _MULTICAST_PORT)
+        self._socket = socket.socket(fileno=os.dup(self.fileno()))
+        self._forms: dict[tuple[int, int], tuple[bytes, bytes]] = {}
+        self._seen: dict[bytes, tuple[int, int, bytes]] = {}
+        """before the data -> identifier, size of the data, what is behind it"""
         _keep_more(self.fileno())
 
     def put(self, identifier: int, data: bytes) -> None:
-        """Send one frame. Raises CanError."""
-        message = self._message
-        message.arbitration_id, message.dlc, message.data = identifier, len(data), bytearray(data)
-        self.send(message)
+        """Send one frame. Raises OSError."""
+        before, behind = self._form(identifier, len(data))
+        self._socket.sendto(before + data + behind, self._to)
 
     def frame(self, timeout: float) -> Frame | None:
         """The next frame within `timeout` s, one's own ones too."""
         while True:
             try:
-                data = self._in.recv(4096, socket.MSG_DONTWAIT)
+                data = self._socket.recv(4096, socket.MSG_DONTWAIT)
             except BlockingIOError:
-                if timeout == 0 or not select.select([self._in], [], [], timeout)[0]:
+                if timeout == 0 or not select.select([self._socket], [], [], timeout)[0]:
                     return None
                 continue
+            at = _data_at(data)
+            known = self._seen.get(data[:at])
+            if known is not None and data[at + known[1] :] == known[2]:
+                return known[0], data[at : at + known[1]]
             try:
                 message = unpack_message(data)
-                return message.arbitration_id, bytes(message.data)
+                found = message.arbitration_id, bytes(message.data)
             except Exception:  # of msgpack and of python-can, for what is no frame
                 continue
+            if len(self._seen) < _FORMS:
+                before, behind = self._form(found[0], len(found[1]))
+                if before + found[1] + behind == data:
+                    self._seen[before] = found[0], len(found[1]), behind
+            return found
+
+    def _form(self, identifier: int, size: int) -> tuple[bytes, bytes]:
+        """What python-can packs before and behind the data of such a frame."""
+        form = self._forms.get((identifier, size))
+        if form is None:
+            packed = pack_message(_message(identifier, bytes(size)))
+            at = _data_at(packed)
+            form = self._forms[identifier, size] = packed[:at], packed[at + size :]
+        return form
 
     def shutdown(self) -> None:
         super().shutdown()
-        self._in.close()
+        self._socket.close()
+
+
+def _data_at(packed: bytes) -> int:
+    """Where the data of a frame begins that python-can has packed."""
+    return packed.find(_DATA) + len(_DATA) + 1
 
 
 def _keep_more(descriptor: int) -> None:

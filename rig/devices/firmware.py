@@ -105,5 +105,6 @@ class Firmware:
         self._bad = False
         values = np.concatenate((theta, x, y))[self._order] * self._per_unit
         np.rint(values, out=values)
-        counts = values.clip(-32768.0, 32767.0, out=values).astype("<i2").tobytes()
+        np.minimum(np.maximum(values, -32768.0, out=values), 32767.0, out=values)
+        counts = values.astype("<i2").tobytes()
         return RawSample(seq, seq * PERIOD_US % _WRAP, self._answers, flags, counts)

@@ -35,21 +35,39 @@ IDENTITY: Final[Matrix] = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0
 
 
 def multiply(p: Matrix, q: Matrix) -> Matrix:
-    """p q of two rigid transformations."""
-    rows = []
-    for a, b, c, d in p:
-        x, y, z, w = (a * q[0][k] + b * q[1][k] + c * q[2][k] for k in range(4))
-        rows.append((x, y, z, w + d))
-    return tuple(rows)
+    """p q of two rigid transformations, written out: a set-point takes forty of them."""
+    (pxx, pxy, pxz, px), (pyx, pyy, pyz, py), (pzx, pzy, pzz, pz) = p
+    (qxx, qxy, qxz, qx), (qyx, qyy, qyz, qy), (qzx, qzy, qzz, qz) = q
+    return (
+        (
+            pxx * qxx + pxy * qyx + pxz * qzx,
+            pxx * qxy + pxy * qyy + pxz * qzy,
+            pxx * qxz + pxy * qyz + pxz * qzz,
+            pxx * qx + pxy * qy + pxz * qz + px,
+        ),
+        (
+            pyx * qxx + pyy * qyx + pyz * qzx,
+            pyx * qxy + pyy * qyy + pyz * qzy,
+            pyx * qxz + pyy * qyz + pyz * qzz,
+            pyx * qx + pyy * qy + pyz * qz + py,
+        ),
+        (
+            pzx * qxx + pzy * qyx + pzz * qzx,
+            pzx * qxy + pzy * qyy + pzz * qzy,
+            pzx * qxz + pzy * qyz + pzz * qzz,
+            pzx * qx + pzy * qy + pzz * qz + pz,
+        ),
+    )
 
 
 def inverse(p: Matrix) -> Matrix:
     """The opposite of a rigid transformation."""
-    rows = []
-    for k in range(3):
-        a, b, c = p[0][k], p[1][k], p[2][k]
-        rows.append((a, b, c, -(a * p[0][3] + b * p[1][3] + c * p[2][3])))
-    return tuple(rows)
+    (xx, xy, xz, x), (yx, yy, yz, y), (zx, zy, zz, z) = p
+    return (
+        (xx, yx, zx, -(xx * x + yx * y + zx * z)),
+        (xy, yy, zy, -(xy * x + yy * y + zy * z)),
+        (xz, yz, zz, -(xz * x + yz * y + zz * z)),
+    )
 
 
 def forward(q: Joints) -> Matrix:

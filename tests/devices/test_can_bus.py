@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import can
 import pytest
 
-from vibrissa.rig.devices.can_bus import close_bus, open_bus, send_frame
+from vibrissa.rig.devices.can_bus import close_bus, open_bus, receive_frame, send_frame
 from vibrissa.rig.devices.can_layout import FROM_HEAD, FROM_HOST
 from vibrissa.rig.devices.errors import DeviceUnavailable
 
@@ -48,6 +48,42 @@ def test_members_hear_everything_but_what_only_they_say(members: dict[str, can.B
         send_frame(members["anybody"], identifier, data)
     for name, own in (("host", FROM_HOST), ("head", FROM_HEAD)):
         assert heard(members[name]) == [frame for frame in said if frame[0] not in own]
+
+
+def test_multicast_is_python_cans() -> None:
+    channel = "239.74.163.78"
+    try:
+        ours = open_bus("ours", "udp_multicast", channel)
+    except DeviceUnavailable as error:
+        pytest.skip(str(error))
+    theirs = can.Bus(interface="udp_multicast", channel=channel, fd=True, hop_limit=0)
+    try:
+        # twice each: packed, and known again, by what was learnt the first time
+        said = 2 * [(i, bytes(range(n))) for i in (0, 0x80, 0x7FF) for n in (0, 8, 64)]
+        said += [(0x80, b"\xa4data\xc4\x08\x00")]
+        for identifier, data in said:
+            send_frame(ours, identifier, data)
+        assert heard(theirs) == said
+        while receive_frame(ours, 0.0) is not None:
+            pass  # it hears itself
+        found = []
+        for identifier, data in said:
+            for fd in (True, False) if len(data) <= 8 else (True,):
+                theirs.send(
+                    can.Message(
+                        arbitration_id=identifier,
+                        data=data,
+                        is_fd=fd,
+                        bitrate_switch=fd,
+                        is_extended_id=False,
+                    )
+                )
+                found.append(receive_frame(ours, 1.0))
+                assert found[-1] == (identifier, data)
+        assert len(found) > len(said)
+    finally:
+        close_bus(ours)
+        close_bus(theirs)
 
 
 def test_an_own_frame_does_not_wake_its_sender(members: dict[str, can.BusABC]) -> None:
