@@ -18,7 +18,6 @@ from vibrissa.messages.types import TICK_NS, WHISKERS
 from vibrissa.processes.config import Experiment
 from vibrissa.processes.node import Node, Stepper
 from vibrissa.processes.results import RunError
-from vibrissa.processes.slams import warm
 from vibrissa.processes.table import ROWS, SLAM_SLOTS, SLOTS, build
 
 TICKS = 1600
@@ -45,6 +44,8 @@ def rehearse(name: str, experiment: Experiment, controller: str | None = None) -
     node = build(name, short)
     algorithm = controller or experiment.slam.algorithm
     if name == "slam" or name in SLAM_SLOTS:
+        from vibrissa.processes.slams import warm  # a third of a second that nobody else needs
+
         warm(algorithm, experiment)
     if name in SLAM_SLOTS:
         order = types.Order(0, "assign", name, algorithm, "", -1, 0)
