@@ -29,6 +29,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from vibrissa.compilation import kept
 from vibrissa.numerics import atan2, compiled, cos, sin
 from vibrissa.rig.elastica import (
     LYING,
@@ -150,19 +151,25 @@ def _tip_rows(r: float, table: Float64s, steps: int) -> None:
 def peg_table(size: int = SIZE) -> NDArray[np.float64]:
     """The peg table, float64[size, size, 4], read-only; size: odd and at least 7."""
     table = _empty(size)
-    for n in range(size):
-        _peg_row(LEAST_Q + (1.0 - LEAST_Q) * n / (size - 1), table[n], STEPS)
-    table.setflags(write=False)
-    return table
+
+    def make() -> NDArray[np.float64]:
+        for n in range(size):
+            _peg_row(LEAST_Q + (1.0 - LEAST_Q) * n / (size - 1), table[n], STEPS)
+        return table
+
+    return kept(_peg_row, None, table.shape, make)
 
 
 @lru_cache(maxsize=64)
 def tip_table(r: float, size: int = SIZE) -> NDArray[np.float64]:
     """The table of a tip on a plane, float64[size, size, 4], read-only; r: tip over base."""
     table = _empty(size)
-    _tip_rows(r, table, STEPS)
-    table.setflags(write=False)
-    return table
+
+    def make() -> NDArray[np.float64]:
+        _tip_rows(r, table, STEPS)
+        return table
+
+    return kept(_tip_rows, r, table.shape, make)
 
 
 def _empty(size: int) -> NDArray[np.float64]:

@@ -1,3 +1,4 @@
+import ast
 import hashlib
 import importlib.util
 import itertools
@@ -8,6 +9,7 @@ import shutil
 import statistics
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import llvmlite.binding
@@ -22,7 +24,7 @@ from scipy import stats
 
 import vibrissa
 from vibrissa import elementary
-from vibrissa.compilation import CacheFile
+from vibrissa.compilation import CacheFile, imports, kept
 from vibrissa.numerics import (
     MAX_ANGLE,
     acos,
@@ -602,3 +604,46 @@ def test_bits_are_those_of_every_other_machine():
     assert digest.hexdigest() == (
         "7dee29167b755f01f23de0bb6643657f7ca6fd1170848be0a0d9882aad1ea1f5"
     )
+
+
+def test_every_import_of_the_package_is_found_in_its_sources():
+    def parsed(source):
+        for node in ast.walk(ast.parse(source)):
+            if isinstance(node, ast.Import):
+                yield from (alias.name for alias in node.names)
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                yield node.module
+                yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+    folder = Path(vibrissa.__file__).parent
+    sources = [
+        file.read_text() for part in ("", "*/", "*/*/") for file in folder.glob(f"{part}*.py")
+    ]
+    assert len(sources) > 150
+    for source in sources:
+        own = {name for name in parsed(source) if name.partition(".")[0] == "vibrissa"}
+        assert own <= imports(source)
+
+
+def test_a_table_on_disk_is_used_unless_it_is_damaged(tmp_path):
+    made = []
+
+    def make():
+        made.append(np.arange(6.0).reshape(2, 3))
+        return made[-1]
+
+    kernel = types.SimpleNamespace(py_func=make, _cache=types.SimpleNamespace(cache_path=tmp_path))
+    for case, times in ((0.3, 1), (0.3, 1), (0.5, 2)):
+        table = kept(kernel, case, (2, 3), make)
+        assert table.tobytes() == made[0].tobytes() and not table.flags.writeable
+        assert len(made) == times
+    (first, _) = sorted(tmp_path.iterdir())
+    whole = first.read_bytes()
+    for damaged in (b"", whole[:-1], whole[:40] + bytes([whole[40] ^ 1]) + whole[41:]):
+        first.write_bytes(damaged)
+        kept(kernel, 0.3, (2, 3), make)
+        kept(kernel, 0.5, (2, 3), make)
+        assert first.read_bytes() == whole
+    assert len(made) == 5
+    nowhere = types.SimpleNamespace(py_func=make)
+    assert kept(nowhere, 0.3, (2, 3), make) is made[-1]

@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
-import ast
+import contextlib
 import functools
 import hashlib
-from collections.abc import Callable, Iterator
+import math
+import os
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
 from numba import types
 from numba.core.caching import IndexDataCacheFile
+from numba.core.registry import cpu_target
 from numba.extending import intrinsic
+from numpy.typing import NDArray
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+Table = NDArray[np.float64]
+
 _PACKAGE = Path(__file__).parent
+_DIGEST = 32
+_IMPORT = re.compile(
+    r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]*(?:\(([^)]*)\)|(.+))|import[ \t]+(.+))", re.M
+)
 
 
 def compiled(function: F) -> F:
@@ -86,15 +98,59 @@ def _checked(dispatcher: Any) -> Any:
     return dispatcher
 
 
+def kept(kernel: Any, case: object, shape: tuple[int, ...], make: Callable[[], Table]) -> Table:
+    """What `make` computes with a compiled kernel, float64[shape], read-only; once per machine.
+
+    On disk beside the kernel's machine code and valid for as long: named after the sources it
+    depends on, the processor, and `case`, which tells apart what one kernel is used for. A file
+    that is damaged or can't be read counts as none.
+    """
+    folder = getattr(getattr(kernel, "_cache", None), "cache_path", None)
+    if folder is None:  # not compiled, or nowhere to keep it
+        table = make()
+    else:
+        source = source_digest(kernel.py_func.__code__.co_filename)
+        key = (source, cpu_target.target_context.codegen().magic_tuple(), case, shape)
+        name = f"{kernel.py_func.__name__}.{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}"
+        file = Path(folder) / f"{name}.table"
+        found = _load(file, shape)
+        table = make() if found is None else found
+        if found is None:
+            _store(file, table)
+    table.setflags(write=False)
+    return table
+
+
+def _load(file: Path, shape: tuple[int, ...]) -> Table | None:
+    try:
+        data = file.read_bytes()
+    except OSError:
+        return None
+    digest, content = data[:_DIGEST], data[_DIGEST:]
+    if len(content) != 8 * math.prod(shape) or hashlib.sha256(content).digest() != digest:
+        return None
+    return np.frombuffer(content, np.float64).reshape(shape).copy()
+
+
+def _store(file: Path, table: Table) -> None:
+    content = table.tobytes()
+    scratch = file.with_name(f".{file.name}-{os.getpid()}")
+    with contextlib.suppress(OSError):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        scratch.write_bytes(hashlib.sha256(content).digest() + content)
+        scratch.replace(file)
+
+
 @functools.cache
 def source_digest(path: str) -> str:
     """SHA-256 over a source file and all files of this package that it imports, at any depth."""
     found: dict[str, bytes] = {}
-    open_files = [Path(path)]
+    open_files = [Path(path).resolve()]
     while open_files:
-        file = open_files.pop().resolve()
-        if str(file) not in found:
-            found[str(file)], imported = _parsed(file)
+        file = open_files.pop()
+        name = os.path.relpath(file, _PACKAGE)
+        if name not in found:
+            found[name], imported = _read(file)
             open_files += imported
     digest = hashlib.sha256()
     for name, source in sorted(found.items()):
@@ -103,18 +159,22 @@ def source_digest(path: str) -> str:
 
 
 @functools.cache
-def _parsed(file: Path) -> tuple[bytes, list[Path]]:
+def _read(file: Path) -> tuple[bytes, list[Path]]:
     source = file.read_bytes()
-    names = [name for node in ast.walk(ast.parse(source)) for name in _imported(node)]
-    parts = [name.split(".")[1:] for name in names if name.split(".")[0] == _PACKAGE.name]
-    places = [_PACKAGE.joinpath(*part) for part in parts]
+    places = [_PACKAGE.joinpath(*name.split(".")[1:]) for name in imports(source.decode())]
     files = [file for place in places for file in (place.with_suffix(".py"), place / "__init__.py")]
-    return source, [file for file in files if file.is_file()]
+    return source, [file.resolve() for file in files if file.is_file()]
 
 
-def _imported(node: ast.AST) -> Iterator[str]:
-    if isinstance(node, ast.Import):
-        yield from (alias.name for alias in node.names)
-    elif isinstance(node, ast.ImportFrom) and node.module:
-        yield node.module
-        yield from (f"{node.module}.{alias.name}" for alias in node.names)
+def imports(source: str) -> set[str]:
+    """Whatever a source may import from this package: modules, and names that may be modules.
+
+    By its text: every process of a run looks through some fifty files, and parsing them takes a
+    quarter of a second. Too much does no harm, and a test sees to it that nothing is missed.
+    """
+    found: set[str] = set()
+    for module, inside, behind, plain in _IMPORT.findall(source):
+        listed = [name.partition("#")[0] for name in (inside or behind or plain).splitlines()]
+        names = [name.split()[0] for name in ",".join(listed).split(",") if name.strip()]
+        found |= {module, *(f"{module}.{name}" for name in names)} if module else set(names)
+    return {name for name in found if name.partition(".")[0] == _PACKAGE.name}
