@@ -73,13 +73,14 @@ def devices(experiment: Experiment, folder: Path) -> Iterator[Devices]:
 
 
 def head_cores(experiment: Experiment) -> Cores:
-    """Where an emulated head disturbs least on two cores: where the process that reads it is not.
+    """Where an emulated head disturbs least on two cores.
 
-    Who runs first is never moved. The reflex loop in processes of its own works while the head
-    waits, and the other way round; in the process of the head's device it goes on without a break.
+    Who runs first is never moved. Beside a reflex loop in processes of its own that is the loop's
+    core: the one works while the other waits. The process of the head's device that hosts the loop
+    goes on without a break: beside that, the scheduler finds the emulator room.
     """
     shared = next((group for group in experiment.run.together if "rig" in group), [])
-    return "others" if any(PROCESSES[n].cores == "reflex" for n in shared) else "reflex"
+    return "any" if any(PROCESSES[n].cores == "reflex" for n in shared) else "reflex"
 
 
 def _favour(pid: int, cores: Cores) -> None:
