@@ -1,7 +1,8 @@
 """Runs with devices on a wire: what a run does, says and logs when all is well and when not.
 
 The devices are emulated; the head's process hosts the reflex loop, or does not. What is asserted
-follows from the log, however slow this machine is: the time-outs are long. That they come after the stated ticks is tested in `test_device_process`.
+follows from the log, however slow this machine is: the time-outs are long. That they come after the
+stated ticks is tested in `test_device_process`.
 """
 
 from __future__ import annotations
