@@ -9,6 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from vibrissa.processes.config import DEFAULT_MAZE, Experiment, Section, load_experiment
+from vibrissa.processes.emulators import head_cores
 from vibrissa.processes.results import RunError
 from vibrissa.processes.run_plan import layout_of_run
 
@@ -88,7 +89,9 @@ def test_nodes_may_share_the_process_of_a_real_head(tmp_path: Path) -> None:
     path.write_text(
         """[run]\ntogether = [["rig", "sampler", "whisk"]]\n[rig]\nhead = "serial:/dev/ttyACM0"\n"""
     )
-    layout = layout_of_run(load_experiment(path), tmp_path, tmp_path, {})
+    experiment = load_experiment(path)
+    assert head_cores(experiment) == "any" and head_cores(Experiment()) == "reflex"
+    layout = layout_of_run(experiment, tmp_path, tmp_path, {})
     joined = "head-device+sampler+whisk"
     assert layout.hosts[joined] == ["head-device", "sampler", "whisk"]
     assert set(layout.hosts) == {joined, "arm-device", "arm", "slam"}
