@@ -38,7 +38,8 @@ class Run(Section):
     duration: Annotated[float, Field(ge=1, le=86400 * 7, description="s, simulated or real")] = 30.0
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 1
     together: Annotated[
-        list[list[str]], Field(description="groups of nodes that share one process")
+        list[list[str]],
+        Field(description="groups of nodes that share one process; rig: that of a real head, too"),
     ] = []
     realtime: Annotated[bool, Field(description="ask for SCHED_FIFO and locked memory")] = True
     transport: Annotated[Literal["ipc", "tcp"], Field(description="tcp: loopback only")] = "ipc"
@@ -241,8 +242,6 @@ class Experiment(Section):
                 if node in seen:
                     raise ValueError(f"run.together: {node!r} is named twice")
                 seen.add(node)
-        if "rig" in seen and not self.rig.virtual:
-            raise ValueError("run.together: 'rig' is real or emulated, in processes of its own")
         for node in ("whisk", "slam", "arm"):
             cycles = [swap.at_cycle for swap in self.swap if swap.node == node]
             if any(later - earlier < 2 for earlier, later in itertools.pairwise(cycles)):

@@ -13,9 +13,10 @@ from typing import Final
 
 from vibrissa.processes.arm import make_path
 from vibrissa.processes.config import Experiment
-from vibrissa.processes.realtime import choose_cores
+from vibrissa.processes.realtime import Cores, choose_cores
 from vibrissa.processes.results import RunError
 from vibrissa.processes.rig import head_settings
+from vibrissa.processes.table import PROCESSES
 from vibrissa.rig.devices.addresses import make_arm, make_head, parse
 from vibrissa.rig.devices.emulation import EmulatorProcess
 from vibrissa.rig.devices.errors import DeviceError
@@ -48,7 +49,7 @@ def devices(experiment: Experiment, folder: Path) -> Iterator[Devices]:
             emulator = stack.enter_context(EmulatorProcess(kind, arguments))
             found.emulators[what] = emulator
             if experiment.run.realtime:
-                _favour(emulator.pid, head=what == "head")
+                _favour(emulator.pid, head_cores(experiment) if what == "head" else "any")
             return emulator
 
         pose = ",".join(map(repr, make_path(experiment).pose(0)))
@@ -71,17 +72,24 @@ def devices(experiment: Experiment, folder: Path) -> Iterator[Devices]:
         yield found
 
 
-def _favour(pid: int, *, head: bool) -> None:
-    """Have an emulator run before everybody else, and a head where it disturbs least.
+def head_cores(experiment: Experiment) -> Cores:
+    """Where an emulated head disturbs least on two cores.
 
-    Of two cores that is the one of the reflex loop: the head waits while that works and the other
-    way round. Who runs first is never moved, and the other core has enough to do.
+    Who runs first is never moved. Beside a reflex loop in processes of its own that is the loop's
+    core: the one works while the other waits. The process of the head's device that hosts the loop
+    goes on without a break: beside that, the scheduler finds the emulator room.
     """
+    shared = next((group for group in experiment.run.together if "rig" in group), [])
+    return "any" if any(PROCESSES[n].cores == "reflex" for n in shared) else "reflex"
+
+
+def _favour(pid: int, cores: Cores) -> None:
+    """Have an emulator run before everybody else; on two cores, on these."""
     with contextlib.suppress(OSError):
         os.sched_setscheduler(pid, os.SCHED_FIFO, os.sched_param(PRIORITY))
-        cores = os.sched_getaffinity(0)
-        if head and len(cores) == 2:
-            os.sched_setaffinity(pid, choose_cores(cores, "reflex"))
+        available = os.sched_getaffinity(0)
+        if len(available) == 2:
+            os.sched_setaffinity(pid, choose_cores(available, cores))
 
 
 def _head_wire(url: str, folder: Path) -> tuple[str, list[str], str]:

@@ -55,7 +55,7 @@ class HeadPump(Pump):
         self._base: int | None = None
         self._next = 0
         self._due = (0, 0, 1.0)
-        self._went_out = [0] * PROBES
+        self._came_in = [0] * PROBES
         self._told = dataclasses.asdict(self._head.counters)
 
     def opened(self) -> None:
@@ -127,19 +127,19 @@ class HeadPump(Pump):
             self.report("gap", f"{self._head.name}: {lost} samples lost before tick {tick}")
         self._next = tick + 1
         body = HeadReading(tick, reading.answers, reading.theta, reading.x, reading.y)
-        self.say("rig.sample", body)
+        self._came_in[tick % PROBES] = start
+        frame = self.publish("rig.sample", body)
         self.steps += 1
         self.watch.seen("sample", self.now)
         at, due, scale = self._due
-        end = time.monotonic_ns()
-        self._went_out[tick % PROBES] = end
         expected = self.t0 + due + int((tick - at) * TICK_NS * scale)
-        self.clock.tick(expected, start, end)
+        self.clock.tick(expected, start, time.monotonic_ns())
+        self._feed(frame)
 
     def _command(self, message: Message) -> None:
         tick, now = message.body.tick, time.monotonic_ns()
         self._head.write(tick, message.body.command)
         self.watch.seen("command", self.now)
-        went = self._went_out[tick % PROBES]
-        if went and self.tick - tick < PROBES:
-            self.clock.latency.add((now - went) * 1e-3)
+        came = self._came_in[tick % PROBES]
+        if came and self.tick - tick < PROBES:
+            self.clock.latency.add((now - came) * 1e-3)

@@ -27,7 +27,7 @@ def main() -> None:
             from vibrissa.processes import recorder
 
             recorder.main(layout)
-        elif name in DEVICES:
+        elif DEVICES.keys() & layout.hosts.get(name, []):
             from vibrissa.processes import pump
 
             pump.main(name, layout)

@@ -7,7 +7,6 @@ supervisor is gone.
 
 from __future__ import annotations
 
-import collections
 import os
 import time
 from abc import ABC, abstractmethod
@@ -52,7 +51,6 @@ class Member(ABC):
             bundled=layout.bundled(name),
         )
         self.gate = Gate(own=layout.hosts.get(name, [name]))
-        self.sent: collections.Counter[str] = collections.Counter()
         self.t0 = 0
         self.stopping = False
         self.done = False

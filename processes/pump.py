@@ -3,10 +3,12 @@
 It takes the place of `rig` where a device is real or emulated. It is no node: what it publishes is
 a recorded input of the run, and every decision it takes about the device is a `rig.event`. It opens
 its device while the run warms up, reads it from then on, and lets nothing move before the start.
+Nodes may share its process: they and the device then hear each other in memory.
 """
 
 from __future__ import annotations
 
+import collections
 import signal
 import time
 import traceback
@@ -14,21 +16,24 @@ from abc import abstractmethod
 from typing import Any, Final
 
 from vibrissa.messages.codec import CODECS, Message, decode, header
-from vibrissa.messages.errors import DecodeError
+from vibrissa.messages.errors import DecodeError, MessageError
 from vibrissa.messages.types import TICK_NS, DeviceClock, Event
 from vibrissa.processes.config import Experiment
+from vibrissa.processes.hosted import TELEMETRY_NS, Hosted, wanted
 from vibrissa.processes.layout import Layout
 from vibrissa.processes.member import Member, telemetry
+from vibrissa.processes.node import Step
+from vibrissa.processes.rehearsal import rehearse
 from vibrissa.processes.results import RunError, one_line
 from vibrissa.processes.stats import Clocking
-from vibrissa.processes.table import DEVICES
+from vibrissa.processes.table import DEVICES, ROWS
 from vibrissa.rig.devices.arm import ArmDevice
 from vibrissa.rig.devices.clock import ClockRelation
 from vibrissa.rig.devices.errors import DeviceError
 from vibrissa.rig.devices.head import HeadDevice
 from vibrissa.rig.devices.watch import Watch
 
-TELEMETRY_NS: Final = 1_000_000_000
+PARTING_S: Final = 0.02
 
 
 class Pump(Member):
@@ -37,12 +42,21 @@ class Pump(Member):
     device: HeadDevice | ArmDevice
     watch: Watch
 
-    def __init__(self, name: str, layout: Layout) -> None:
+    def __init__(self, who: str, layout: Layout) -> None:
+        """who: the row of the device; its process may host nodes, too."""
+        self.who = who
         self.experiment = Experiment.model_validate_json(layout.experiment)
-        row = DEVICES[name]
-        super().__init__(
-            name, layout, row.priority if self.experiment.run.realtime else 0, row.cores
-        )
+        name, members = next((p, nodes) for p, nodes in layout.hosts.items() if who in nodes)
+        nodes = [n for n in members if n != who]
+        for node in nodes:
+            rehearse(node, self.experiment)
+        priority, cores = wanted([DEVICES[who], *(ROWS[n] for n in nodes)])
+        super().__init__(name, layout, priority if self.experiment.run.realtime else 0, cores)
+        self.nodes = Hosted(nodes, self.experiment, self.port.publish, self._overhear)
+        self._hears = {topic.encode() for topic in DEVICES[who].hears}
+        self._lost = self._nodes_failed = False
+        self._trouble: DeviceError | None = None
+        self.sent: collections.Counter[str] = collections.Counter()
         self.clock = Clocking()
         self.last_tick = self.experiment.ticks
         self.tick = 0
@@ -63,20 +77,22 @@ class Pump(Member):
                 self.turn()
                 self.housekeep()
         except DeviceError as error:
-            self.give_up(str(error))
+            self._lose(str(error))
         except Exception as error:
             traceback.print_exc()
-            self.give_up(f"{type(error).__name__}: {error}")
+            self._lose(f"{type(error).__name__}: {error}")
         finally:
             self.device.close()
+        self._see_out()
         self._account()
+        self.nodes.hand_in(final=True)
         self.port.flush()
         self.control.say(
             "bye",
-            sent=dict(self.sent),
-            stats={self.name: self.clock.summary()},
+            sent=dict(self.sent + self.nodes.sent()),
+            stats={self.who: self.clock.summary()} | self.nodes.stats(),
             cpu_s=time.process_time() - cpu,
-            counters={self.name: self.counters()},
+            counters={self.who: self.counters()} | self.nodes.counters(),
         )
         self.control.wait_to_leave(self.parent)
         self.leave()
@@ -86,13 +102,13 @@ class Pump(Member):
         self.device.open()
         try:
             self.opened()
-            wanted = self.layout.audience(self.name)
-            waiting = self.control.wait_for_go(self.parent, self.port.subscribers, wanted)
+            heard = self.layout.audience(self.name)
+            waiting = self.control.wait_for_go(self.parent, self.port.subscribers, heard)
             while True:
                 next(waiting)
                 self.drain()
         except StopIteration as end:
-            self.t0 = end.value
+            self.t0 = self.nodes.t0 = end.value
         except BaseException:
             self.device.close()
             raise
@@ -127,28 +143,78 @@ class Pump(Member):
         return max((time.monotonic_ns() - self.t0) // TICK_NS, 0)
 
     def hear(self) -> None:
-        """Take everything that was said on the bus."""
+        """Take everything that was said on the bus; nodes of this process come first."""
         while (frame := self.port.receive(0)) is not None:
             if not self.gate.admits(frame):
                 continue
             try:
-                message = decode(frame)
+                self._feed(frame)
+                message = decode(frame) if _topic(frame) in self._hears else None
             except DecodeError as error:
                 self.gate.refuse(header(frame)[1], str(error))
                 continue
-            self._take(message)
+            if message is not None:
+                self._take(message)
+
+    def _feed(self, frame: bytes) -> None:
+        """Have the nodes of this process hear a frame, and the device what they say to that.
+
+        A node that fails ends all of them, and the run. Raises DeviceError when the device could
+        not do what they said, once everybody has heard it.
+        """
+        if self._nodes_failed:
+            return
+        try:
+            self.nodes.feed(frame)
+        except DecodeError:
+            raise
+        except MessageError as error:
+            self._end_nodes(str(error))
+        except Exception as error:
+            traceback.print_exc()
+            self._end_nodes(f"{type(error).__name__}: {error}")
+        if self._trouble is not None:
+            trouble, self._trouble = self._trouble, None
+            raise trouble
+
+    def _end_nodes(self, cause: str) -> None:
+        self._nodes_failed = True
+        self.control.say("fault", cause=cause[:400])
+        self.give_up(cause)
+
+    def _overhear(self, _frame: bytes, step: Step) -> None:
+        """What a node of this process has just said reaches the device before anything else."""
+        for output in step.outputs:
+            if _topic(output) in self._hears:
+                try:
+                    self._take(decode(output))
+                except DeviceError as error:
+                    self._trouble = self._trouble or error
 
     def _take(self, message: Message) -> None:
         if message.topic not in ("run.event", "rig.event"):
-            self.heard(message)
+            if not self._lost:
+                self.heard(message)
             return
         event: Event = message.body
         if event.kind in ("retract", "stop"):
             self.watch.stop(event.cause)
             self.halt(event.cause)
             self.stopping |= message.topic == "run.event" and event.kind == "stop"
-        elif message.topic == "run.event":
+        elif message.topic == "run.event" and not self._lost:
             self.heard(message)
+
+    def _lose(self, cause: str) -> None:
+        """Go on without the device, which is not to be used any more."""
+        self._lost = True
+        self.give_up(cause)
+
+    def _see_out(self) -> None:
+        """Nodes of this process take the last decisions of the run even if the device is lost."""
+        while self.nodes.names and not (self.stopping or self._nodes_failed):
+            if self.port.wait(-1, PARTING_S):
+                self.hear()
+            self.housekeep()
 
     def give_up(self, cause: str) -> None:
         """Stop for good, and tell everybody: whiskers retract, the arm brakes, the run ends."""
@@ -164,13 +230,19 @@ class Pump(Member):
 
     def report(self, kind: str, cause: str) -> None:
         """Say what happened to the device, for every node and the log."""
-        self.say("rig.event", Event(self.tick, kind, self.name, one_line(cause)))
+        self.say("rig.event", Event(self.tick, kind, self.who, one_line(cause)))
 
     def say(self, topic: str, body: Any) -> None:
-        """Publish in the name of this process."""
+        """Say something in the name of the device, to the bus and to the nodes of this process."""
+        self._feed(self.publish(topic, body))
+
+    def publish(self, topic: str, body: Any) -> bytes:
+        """Put something on the bus in the name of the device; gives the frame."""
         seq = self.sent[topic]
         self.sent[topic] += 1
-        self.port.publish(CODECS[topic].encode(self.name, 0, seq, self.tick * TICK_NS, body))
+        frame = CODECS[topic].encode(self.who, 0, seq, self.tick * TICK_NS, body)
+        self.port.publish(frame)
+        return frame
 
     def say_clock(self, device: str, relation: ClockRelation, device_ns: int) -> int:
         """Publish how the device's clock reads on the host's; gives the host's ns since t0."""
@@ -180,10 +252,12 @@ class Pump(Member):
         return host_ns
 
     def progress(self) -> tuple[int, int]:
-        return self.tick * TICK_NS, self.steps
+        return self.tick * TICK_NS, self.steps + self.nodes.steps
 
     def look_after(self) -> None:
-        self.look_at_device()
+        self.nodes.hand_in(final=False)
+        if not self._lost:
+            self.look_at_device()
         now = time.monotonic_ns()
         if now - self._accounted > TELEMETRY_NS:
             self._accounted = now
@@ -191,6 +265,8 @@ class Pump(Member):
 
     def orphaned(self) -> None:
         self.give_up("supervisor gone")
+        if not self._nodes_failed:
+            self.nodes.inject("stop", "supervisor gone")
 
     def look_at_device(self) -> None:
         """Some twenty times a second."""
@@ -199,10 +275,14 @@ class Pump(Member):
         self.say("node.telemetry", telemetry(self.clock, self.steps))
 
 
+def _topic(frame: bytes) -> bytes:
+    return frame[: frame.find(b"\0")]
+
+
 def main(name: str, layout: Layout) -> None:
     """Entry point of a device process."""
     from vibrissa.processes.arm_device import ArmPump
     from vibrissa.processes.head_device import HeadPump
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    (HeadPump if name == "head-device" else ArmPump)(layout).run()
+    (HeadPump if "head-device" in layout.hosts[name] else ArmPump)(layout).run()

@@ -60,7 +60,11 @@ def layout_of_run(
 ) -> Layout:
     """Processes, end points and log of a live run. Raises RunError for a port in use."""
     run = experiment.run
-    together = {n: "+".join(group) for group in run.together for n in group}
+    of_rig = "rig" if experiment.rig.virtual else "head-device"
+    groups = [
+        [of_rig if n == "rig" else n for n in PROCESSES if n in group] for group in run.together
+    ]
+    together = {n: "+".join(group) for group in groups for n in group}
     nodes = [name for name in PROCESSES if experiment.rig.virtual or name != "rig"]
     alone = nodes if experiment.rig.virtual else [*DEVICES, *nodes]
     hosts = {host: host.split("+") for host in (together.get(name, name) for name in alone)}

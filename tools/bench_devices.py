@@ -3,8 +3,8 @@
 Runs follow one another in one call: virtual, serial, CAN FD; the arm over RTDE in the latter two.
 Of each: samples and messages lost, the time from a sample's arrival to the command that answers it,
 and how many ticks later the drives obey, as the head itself reports it. Beside them how much faster
-than the stream the parsers read. On fewer than four cores `sampler` and `whisk` share a process in
-all three: emulators take the place of hardware, and of its cores.
+than the stream the parsers read. On fewer than four cores `sampler` and `whisk` share the process
+of `rig` in all three: emulators take the place of hardware, and of its cores.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def rigs() -> dict[str, Rig]:
 def bench(out: Path, duration: float, on_progress: OnProgress, *, quick: bool = False) -> Bench:
     """Measure; the runs are kept in `out`. quick: three seconds of each."""
     experiment = load_experiment(duration=min(duration, QUICK_S) if quick else duration)
-    experiment = with_room(experiment, [["sampler", "whisk"]])
+    experiment = with_room(experiment, [["rig", "sampler", "whisk"]])
     rows = []
     for name, rig in rigs().items():
         asked = experiment.model_copy(update={"rig": rig})

@@ -24,7 +24,7 @@ ATTEMPTS: Final = 20
 """How often free whisking may be disturbed by a late controller and begin again."""
 
 
-CLOSE: Final = [["sampler", "whisk"]]
+CLOSE: Final = [["rig", "sampler", "whisk"]]
 """In one process: commands come in time on small machines too, and there is nothing to isolate."""
 
 

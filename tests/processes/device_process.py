@@ -14,7 +14,7 @@ import pytest
 from tests.devices.stepped import TICK_NS, HandClock, MutableArm, stepped_head
 from vibrissa.messages.codec import CODECS, Message, decode
 from vibrissa.messages.types import ArmSetpoint, DeviceClock, Event, HeadCommand
-from vibrissa.processes import arm_device, head_device, member, pump
+from vibrissa.processes import arm_device, head_device, hosted, member, pump
 from vibrissa.processes.arm import make_path
 from vibrissa.processes.arm_device import ArmPump
 from vibrissa.processes.config import Experiment, load_experiment
@@ -30,12 +30,14 @@ LEAD_NS = 100_000_000
 class Bus:
     """The process's port and control line, and the rest of the run behind them.
 
-    said: what the process published; control: what it told its supervisor.
+    said: what the process published; frames: all that was said; control: what it told its
+    supervisor.
     """
 
     def __init__(self, clock: HandClock) -> None:
         self.clock = clock
         self.said: list[Message] = []
+        self.frames: list[bytes] = []
         self.control: list[tuple[str, dict[str, Any]]] = []
         self.t0 = 0
         self._inbox: collections.deque[bytes] = collections.deque()
@@ -45,7 +47,9 @@ class Bus:
         """Something that the process hears."""
         seq = self._seq[topic, source]
         self._seq[topic, source] += 1
-        self._inbox.append(CODECS[topic].encode(source, 0, seq, max(self.tick, 0) * TICK_NS, body))
+        frame = CODECS[topic].encode(source, 0, seq, max(self.tick, 0) * TICK_NS, body)
+        self.frames.append(frame)
+        self._inbox.append(frame)
 
     def decide(self, kind: str, cause: str = "because") -> None:
         """The supervisor's word."""
@@ -73,6 +77,7 @@ class Bus:
         return self._inbox.popleft() if self._inbox else None
 
     def publish(self, frame: bytes) -> None:
+        self.frames.append(frame)
         self.said.append(decode(frame))
 
     def subscribers(self) -> dict[str, int]:
@@ -100,17 +105,24 @@ class Bus:
 
 
 class World:
-    """One run of one device process, from its opening to its farewell."""
+    """One run of one device process, from its opening to its farewell; it may host nodes."""
 
-    def __init__(self, patch: pytest.MonkeyPatch, experiment: Experiment, name: str) -> None:
+    def __init__(
+        self,
+        patch: pytest.MonkeyPatch,
+        experiment: Experiment,
+        name: str,
+        nodes: tuple[str, ...] = (),
+    ) -> None:
         self.clock = HandClock()
-        self.clock.put_into(patch, member, pump, head_device, arm_device)
+        self.clock.put_into(patch, member, hosted, pump, head_device, arm_device)
         self.bus = Bus(self.clock)
         patch.setattr(member, "ControlLine", lambda *_: self.bus)
         patch.setattr(member, "ZmqPort", lambda *_, **__: self.bus)
         patch.setattr(member.realtime, "prepare", lambda *_: [])
-        others = [n for n in PROCESSES if n != "rig"]
-        hosts = {n: [n] for n in (*DEVICES, *others)}
+        patch.setattr(pump, "rehearse", lambda *_: None)
+        others = [n for n in (*DEVICES, *PROCESSES) if n not in ("rig", name, *nodes)]
+        hosts = {"+".join((name, *nodes)): [name, *nodes]} | {n: [n] for n in others}
         names = ("control", "supervisor", "recorder", *hosts, *ALL_SLOTS)
         self.layout = Layout(
             hosts=hosts,
@@ -121,6 +133,7 @@ class World:
             devices={"head": "can:virtual:test", "arm": "virtual"},
         )
         self.patch = patch
+        self.experiment = experiment
         self.name = name
         self.end = experiment.ticks + 400
         self.orders: dict[int, Callable[[], object]] = {}
@@ -148,15 +161,23 @@ class World:
 
 
 class HeadWorld(World):
-    """A head's process; the sampler answers every sample at once, until it is told not to."""
+    """A head's process; the sampler answers every sample at once, until it is told not to.
+
+    nodes: those that share its process, the sampler among them if there are any.
+    """
 
     def __init__(
-        self, patch: pytest.MonkeyPatch, folder: Path, rig: str = "", *arguments: str
+        self,
+        patch: pytest.MonkeyPatch,
+        folder: Path,
+        rig: str = "",
+        *arguments: str,
+        nodes: tuple[str, ...] = (),
     ) -> None:
-        super().__init__(patch, loaded(folder, rig), "head-device")
-        head, self.far_end = stepped_head(self.clock, f"{id(self)}", *arguments)
-        patch.setattr(head_device, "make_head", lambda *_, **__: head)
-        self.answering = True
+        super().__init__(patch, loaded(folder, rig), "head-device", nodes)
+        self.head, self.far_end = stepped_head(self.clock, f"{id(self)}", *arguments)
+        patch.setattr(head_device, "make_head", lambda *_, **__: self.head)
+        self.answering = not nodes
         self._answered = 0
 
     def live(self) -> None:

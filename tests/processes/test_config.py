@@ -9,7 +9,9 @@ import pytest
 from pydantic import ValidationError
 
 from vibrissa.processes.config import DEFAULT_MAZE, Experiment, Section, load_experiment
+from vibrissa.processes.emulators import head_cores
 from vibrissa.processes.results import RunError
+from vibrissa.processes.run_plan import layout_of_run
 
 RAGGED = "+---+---+\n|   |\n+   +---+\n|  |    |\n+---+---+\n"
 SQUARE = "+---+---+\n|       |\n+   +   +\n|       |\n+---+---+\n"
@@ -80,6 +82,22 @@ def test_a_mistake_is_named_with_key_value_and_what_is_allowed(
     line = refusal(tmp_path, text + "\n")
     for word in words:
         assert word in line, line
+
+
+def test_nodes_may_share_the_process_of_a_real_head(tmp_path: Path) -> None:
+    path = tmp_path / "joined.toml"
+    path.write_text(
+        """[run]\ntogether = [["whisk", "rig", "sampler"]]\n[rig]\nhead = "serial:/dev/ttyACM0"\n"""
+    )
+    experiment = load_experiment(path)
+    assert head_cores(experiment) == "any" and head_cores(Experiment()) == "reflex"
+    layout = layout_of_run(experiment, tmp_path, tmp_path, {})
+    joined = "head-device+sampler+whisk"
+    assert layout.hosts[joined] == ["head-device", "sampler", "whisk"]
+    assert set(layout.hosts) == {joined, "arm-device", "arm", "slam"}
+    assert "head.command" in layout.says(joined) and "head.command" not in layout.hears(joined)
+    assert {"rig.arm", "rig.event", "run.event"} <= set(layout.hears(joined))
+    assert layout.metadata["nodes"] == "sampler,whisk,arm,slam"
 
 
 def test_several_mistakes_are_named_together(tmp_path: Path) -> None:

@@ -1,7 +1,8 @@
 """Runs with devices on a wire: what a run does, says and logs when all is well and when not.
 
-The devices are emulated. What is asserted follows from the log, however slow this machine is: the
-time-outs are long. That they come after the stated ticks is tested in `test_device_process`.
+The devices are emulated; the head's process hosts the reflex loop, or does not. What is asserted
+follows from the log, however slow this machine is: the time-outs are long. That they come after the
+stated ticks is tested in `test_device_process`.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ pytestmark = pytest.mark.live
 FILE = """\
 [run]
 duration = {duration}
-together = [["sampler", "whisk"]]
+together = {together}
 [whisk]
 period = 1.0
 calibration_cycles = 1
@@ -56,6 +57,8 @@ arm = "{arm}"
 emulate = {emulate}
 {ticks}
 """
+APART = [["sampler", "whisk"]]
+JOINED = [["rig", "sampler", "whisk"]]
 PATIENT = dict.fromkeys(("sample", "command", "news", "state", "setpoint"), 4000)
 """Ticks of the time-outs: the most there may be, so that no busy machine ends a run by itself."""
 
@@ -66,12 +69,13 @@ def experiment(
     head: str = "serial:/dev/ttyACM0",
     arm: str = "rtde:192.168.0.10",
     emulate: str = "true",
+    together: list[list[str]] = APART,
     **ticks: int,
 ) -> Experiment:
     path = folder / "devices.toml"
     limits = "\n".join(f"{name}_ticks = {n}" for name, n in (PATIENT | ticks).items())
     fields = {"duration": duration, "head": head, "arm": arm, "emulate": emulate}
-    path.write_text(FILE.format(**fields, ticks=limits))
+    path.write_text(FILE.format(**fields, together=together, ticks=limits))
     return load_experiment(path)
 
 
@@ -121,7 +125,7 @@ def setpoints_hold_after(recorded: Recorded, tick: int) -> bool:
 def test_a_run_over_can_fd_and_rtde_does_what_a_virtual_one_does_and_survives_small_faults(
     tmp_path: Path,
 ) -> None:
-    asked = experiment(tmp_path, 3.0, head="can:socketcan:can0")
+    asked = experiment(tmp_path, 3.0, head="can:socketcan:can0", together=JOINED)
     faults = [(0.3, "drop 0.02"), (0.6, "reset"), (0.9, "errors 2e-5"), (1.4, "normal")]
     recorded, found = run(tmp_path, asked, *((at, "head", order) for at, order in faults))
     kinds = collections.Counter((who, event.kind) for who, event in found)
@@ -133,6 +137,8 @@ def test_a_run_over_can_fd_and_rtde_does_what_a_virtual_one_does_and_survives_sm
     assert "VIB-EMU-1, firmware 1.0.0" in found[0][1].cause + found[1][1].cause
     counters = recorded.summary["counters"]
     assert counters["head-device"]["resets"] == 1
+    assert "head-device+sampler+whisk" in recorded.summary["steps"]
+    answered_in_memory(recorded)
     assert counters["arm-device"]["setpoints"] > 0 == counters["arm-device"]["refused"]
     clocks = [message(r).body for r in recorded.records if r.topic == "rig.clock"]
     assert {c.device for c in clocks} == {"head", "arm"}
@@ -149,6 +155,13 @@ def test_a_run_over_can_fd_and_rtde_does_what_a_virtual_one_does_and_survives_sm
         what_if(recorded.log, {"rig": "vibrissa.processes.rig:RigNode"}, tmp_path / "if")
     with pytest.raises(RunError, match="only a virtual rig can be simulated"):
         simulate(asked, tmp_path / "sim")
+
+
+def answered_in_memory(recorded: Recorded) -> None:
+    """In one process every sample is answered before the next one is said."""
+    loop = ("rig.sample", "head.command")
+    said = [r.topic for r in recorded.records if r.topic in loop]
+    assert said == list(loop) * (len(said) // 2)
 
 
 def back_and_forth_as_csv(recorded: Recorded, folder: Path) -> None:
@@ -219,7 +232,7 @@ def rig_of_emulators(folder: Path) -> Iterator[tuple[Experiment, EmulatorProcess
     pose = "--pose=" + ",".join(map(repr, begin))
     host = ["--host", "127.0.2.9"]
     with EmulatorProcess("serial", [pose]) as head, EmulatorProcess("rtde", [*host, pose]) as arm:
-        yield experiment(folder, 60.0, head.url, arm.url, "false"), arm
+        yield experiment(folder, 60.0, head.url, arm.url, "false", JOINED), arm
 
 
 def test_nothing_moves_before_the_operators_start_and_everything_stops_without_a_supervisor(
