@@ -74,7 +74,7 @@ class ZmqPort:
         self._bundling = False
         self._waited_ms = -1
         self._poller: select.poll | None = None
-        self._waiting_for = self._descriptor = -1
+        self._waiting_for = -1
         self._topics = {topic.encode() for topic in topics}
         self._bundled = bundled
         self._unbundled: collections.deque[bytes] = collections.deque()
@@ -124,21 +124,19 @@ class ZmqPort:
             self._unbundle(bundle)
         return self._unbundled.popleft()
 
-    def wait(self, other: int, timeout: float) -> bool:
+    def wait(self, other: int, timeout: float) -> None:
         """Until a frame or the file descriptor `other` can be read, or whole ms of `timeout` s.
 
-        Whether there may be a frame. libzmq's own descriptor tells of a change only, so the socket
-        is asked before anybody sleeps on it.
+        libzmq's own descriptor tells of a change only, so the socket is asked before anybody sleeps
+        on it.
         """
         if self._poller is None or other != self._waiting_for:
             self._poller, self._waiting_for = select.poll(), other
-            self._descriptor = self._in.fileno()
-            self._poller.register(self._descriptor, select.POLLIN)
+            self._poller.register(self._in.fileno(), select.POLLIN)
             if other >= 0:
                 self._poller.register(other, select.POLLIN)
-        heard = bool(int(self._in.get(zmq.EVENTS)) & zmq.POLLIN)
-        ready = self._poller.poll(0 if heard else int(timeout * 1000))
-        return heard or any(descriptor == self._descriptor for descriptor, _ in ready)
+        if not int(self._in.get(zmq.EVENTS)) & zmq.POLLIN:
+            self._poller.poll(int(timeout * 1000))
 
     def _unbundle(self, bundle: bytes) -> None:
         try:

@@ -70,13 +70,13 @@ class ArmPump(Pump):
 
     def turn(self) -> None:
         wire = self._arm.fileno()
-        said = self.port.wait(wire, WAIT_S) if wire >= 0 else True
+        if wire >= 0:
+            self.port.wait(wire, WAIT_S)
         report = self._arm.read(0 if wire >= 0 else VIRTUAL_WAIT_S)
         while report is not None:
             self._moved(report)
             report = self._arm.read(0)
-        if said:
-            self.hear()
+        self.hear()
         if self._asked and time.monotonic_ns() >= self.t0:
             self._start()
         self.look(self.now)

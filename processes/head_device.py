@@ -74,11 +74,11 @@ class HeadPump(Pump):
 
     def turn(self) -> None:
         wire = self._head.fileno()
-        said = self.port.wait(wire, WAIT_S) if wire >= 0 else True
+        if wire >= 0:
+            self.port.wait(wire, WAIT_S)
         for reading in self._head.poll(0.0 if wire >= 0 else VIRTUAL_WAIT_S):
             self._sampled(reading)
-        if said:
-            self.hear()
+        self.hear()
         if not self.done:
             self.look(self.now)
 

@@ -212,8 +212,8 @@ class Pump(Member):
     def _see_out(self) -> None:
         """Nodes of this process take the last decisions of the run even if the device is lost."""
         while self.nodes.names and not (self.stopping or self._nodes_failed):
-            if self.port.wait(-1, PARTING_S):
-                self.hear()
+            self.port.wait(-1, PARTING_S)
+            self.hear()
             self.housekeep()
 
     def give_up(self, cause: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +18,6 @@ from vibrissa.processes.supervisor import run_live
 # The first call of a compiled function compiles it, however long that takes.
 settings.register_profile("vibrissa", deadline=None)
 settings.load_profile("vibrissa")
-
-needs_room = pytest.mark.skipif(
-    len(os.sched_getaffinity(0)) < 4 and not os.environ.get("VIBRISSA_ALL_TESTS"),
-    reason="a live run with emulators or newcomers wants four cores, or VIBRISSA_ALL_TESTS=1",
-)
 
 SHORT = """\
 [run]

@@ -69,9 +69,8 @@ class Bus:
 
     # the port
 
-    def wait(self, other: int, timeout: float) -> bool:
+    def wait(self, other: int, timeout: float) -> None:
         self.clock.sleep(TICK_NS * 1e-9)
-        return bool(self._inbox)
 
     def receive(self, timeout: float) -> bytes | None:
         return self._inbox.popleft() if self._inbox else None

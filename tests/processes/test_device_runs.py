@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.conftest import Recorded, needs_room
+from tests.conftest import Recorded
 from tests.processes.live import Schedule, wait_for
 from tests.processes.logs import message
 from vibrissa.messages.log_format import LogError
@@ -200,15 +200,15 @@ FAULTS = {
 }
 
 
-FIRST, *OTHERS = FAULTS
-
-
-@pytest.mark.parametrize("fault", [FIRST, *(pytest.param(f, marks=needs_room) for f in OTHERS)])
+@pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_of_a_device_retracts_the_whiskers_stops_the_arm_and_ends_the_run(
     fault: str, tmp_path: Path
 ) -> None:
     order, ticks, (who, why) = FAULTS[fault]
-    recorded, found = run(tmp_path, experiment(tmp_path, 20.0, **ticks), (0.5, *order))
+    asked = experiment(tmp_path, 20.0, **ticks)
+    if order[0] == "arm":
+        asked = experiment(tmp_path, 20.0, "can:socketcan:can0", together=JOINED, **ticks)
+    recorded, found = run(tmp_path, asked, (0.5, *order))
     retracts = [(source, event) for source, event in found if event.kind == "retract"]
     assert retracts, "the process of the device decided"
     source, event = retracts[0]

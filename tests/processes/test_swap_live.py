@@ -157,11 +157,12 @@ def all_in_time(out: Path) -> list[tuple[int, str]]:
 
     Those of a busy machine count as well.
     """
-    got, ticks = owners(out), samples(out)
-    falls = [(tick, why.split()[1]) for tick, kind, why in events(out) if kind == "fallback"]
+    got, ticks, told = owners(out), samples(out), events(out)
+    falls = [(tick, why.split()[1]) for tick, kind, why in told if kind == "fallback"]
     for tick, who in falls:
         slot = who.partition("#")[0]
-        last = max(t for t, whose in got.items() if whose == slot and t < tick)
+        began = [t for t, kind, why in told if kind in ("routed", "switched") and who in why]
+        last = max(t for t in [*began, *(t for t in got if got[t] == slot)] if t < tick)
         missed = sum(last < t < tick for t in ticks)
         assert missed <= PATIENCE_TICKS and got[tick] == "retract", (who, last, tick)
     return falls
