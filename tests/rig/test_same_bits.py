@@ -52,7 +52,6 @@ def test_skipping_nothing_gives_the_same_bytes(here: str) -> None:
 
 
 @pytest.mark.skipif(not HAS_FMA, reason="a processor without FMA can't tell")
-def test_the_check_can_fail(here: str, oldest) -> None:
-    libm, fused = digest("libm", {}), digest("fused", {})
-    assert digest("libm", NO_FMA) != libm != here
-    assert digest("fused", oldest) != fused != here
+def test_the_check_can_fail(oldest: dict[str, str]) -> None:
+    assert digest("libm", NO_FMA) != digest("libm", {})
+    assert digest("fused", oldest) != digest("fused", {})
