@@ -9,8 +9,13 @@ number=1
 while [ -e "runs/demo-$number" ]; do number=$((number + 1)); done
 run=runs/demo-$number
 
-echo "== live run, $seconds s"
-"$bin/vibrissa" run --duration "$seconds" --out "$run"
+if [ "$(nproc)" -lt 4 ]; then
+    echo "== live run, $seconds s, placed for $(nproc) cores by docs/examples/two_cores.toml"
+    "$bin/vibrissa" run docs/examples/two_cores.toml --duration "$seconds" --out "$run"
+else
+    echo "== live run, $seconds s"
+    "$bin/vibrissa" run --duration "$seconds" --out "$run"
+fi
 echo "== the same run again from its log, in one process"
 "$bin/vibrissa" verify "$run"
 echo "== and again over real processes and sockets"

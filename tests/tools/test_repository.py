@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 import re
 import subprocess
 from pathlib import Path
@@ -9,8 +11,10 @@ from pathlib import Path
 import pytest
 
 from vibrissa.messages.topics import TOPICS
+from vibrissa.processes.config import load_experiment
 from vibrissa.processes.table import PROCESSES
 from vibrissa.tools import docs
+from vibrissa.tools.machine import advice
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -65,3 +69,9 @@ def test_a_python_that_will_not_do_is_refused_in_one_line() -> None:
     assert found.returncode == 1
     assert found.stdout == ""
     assert found.stderr.count("\n") == 1 and "3.11" in found.stderr
+
+
+def test_the_example_for_two_cores_is_what_doctor_advises(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _pid: {0, 1})
+    experiment = load_experiment(ROOT / "docs" / "examples" / "two_cores.toml")
+    assert any(json.dumps(experiment.run.together) in line for line in advice())
