@@ -32,6 +32,8 @@ from vibrissa.tools.machine import with_room
 
 pytestmark = pytest.mark.live
 
+TOGETHER = [["rig", "sampler", "whisk"], ["arm", "slam"]]
+"""Where newcomers with processes of their own leave no room for one per node."""
 PATIENCE_TICKS = 20
 """Samples without an answer after which the built-in controller takes over."""
 
@@ -99,7 +101,7 @@ def test_newcomers_that_fail_are_refused_by_name_and_change_nothing(
         never=faulty("NeverReady"),
     )
     out = tmp_path / "run"
-    with live(made, out) as run:
+    with live(with_room(made, TOGETHER), out) as run:
         broken, hasty, mortal, noisy = at_once(
             *(load(run, name) for name in ("broken", "hasty", "mortal", "noisy"))
         )
@@ -188,9 +190,8 @@ def swap_or_skip(client: Any, name: str) -> str:
 
 def test_a_slot_is_scheduled_by_what_it_has_and_killed_within_its_ticks(tmp_path: Path) -> None:
     made = experiment(tmp_path, duration=300.0, swaps=((10**6, "forger"),), forger=faulty("Forger"))
-    made = with_room(made, [["rig", "sampler", "whisk"], ["arm", "slam"]])
     out = tmp_path / "run"
-    with live(made, out) as run, run.client() as client:
+    with live(with_room(made, TOGETHER), out) as run, run.client() as client:
         run.told("registered", "whisk.1#0")
         if privileges()["SCHED_FIFO"][0]:
             scheduled_as_told(run, client)
