@@ -28,7 +28,7 @@ _MULTICAST_PORT: Final = 43113
 _DATA: Final = b"\xa4data\xc4"
 """msgpack: a name of four letters, and bytes; how many is the byte behind it."""
 _FORMS: Final = 64
-"""Of frames that are known at sight."""
+"""How many forms of frames are learnt, so that strangers can't have us learn for ever."""
 _HEADER = struct.Struct("<I")
 _KEEP: Final = 1 << 22
 _SO_RCVBUFFORCE: Final = 33
@@ -130,14 +130,14 @@ class MulticastBus(UdpMulticastBus):
                 return known[0], data[at : at + known[1]]
             try:
                 message = unpack_message(data)
-                found = message.arbitration_id, bytes(message.data)
+                identifier, content = message.arbitration_id, bytes(message.data)
+                if len(self._forms) < _FORMS:
+                    before, behind = self._form(identifier, len(content))
+                    if before + content + behind == data:
+                        self._seen[before] = identifier, len(content), behind
             except Exception:  # of msgpack and of python-can, for what is no frame
                 continue
-            if len(self._seen) < _FORMS:
-                before, behind = self._form(found[0], len(found[1]))
-                if before + found[1] + behind == data:
-                    self._seen[before] = found[0], len(found[1]), behind
-            return found
+            return identifier, content
 
     def _form(self, identifier: int, size: int) -> tuple[bytes, bytes]:
         """What python-can packs before and behind the data of such a frame."""

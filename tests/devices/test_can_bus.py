@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import os
 import socket
 from collections.abc import Iterator
 
 import can
+import msgpack
 import pytest
+from can.interfaces.udp_multicast.utils import pack_message
 
-from vibrissa.rig.devices.can_bus import close_bus, open_bus, receive_frame, send_frame
+from vibrissa.rig.devices.can_bus import (
+    MulticastBus,
+    close_bus,
+    open_bus,
+    receive_frame,
+    send_frame,
+)
 from vibrissa.rig.devices.can_layout import FROM_HEAD, FROM_HOST
 from vibrissa.rig.devices.errors import DeviceUnavailable
 
@@ -81,6 +90,33 @@ def test_multicast_is_python_cans() -> None:
                 found.append(receive_frame(ours, 1.0))
                 assert found[-1] == (identifier, data)
         assert len(found) > len(said)
+    finally:
+        close_bus(ours)
+        close_bus(theirs)
+
+
+def test_strangers_frames_on_multicast_end_nothing_and_are_not_learnt_for_ever() -> None:
+    channel = "239.74.163.79"
+    try:
+        ours = open_bus("ours", "udp_multicast", channel)
+    except DeviceUnavailable as error:
+        pytest.skip(str(error))
+    assert isinstance(ours, MulticastBus)
+    theirs = can.Bus(interface="udp_multicast", channel=channel, fd=True, hop_limit=0)
+    whole = msgpack.unpackb(pack_message(can.Message(arbitration_id=1, data=b"12")))
+    wrong = [whole | {"arbitration_id": found} for found in ([], {}, None, "x", -1)]
+    wrong += [whole | {"data": found} for found in (None, 7, "x", [300])]
+    try:
+        with socket.socket(fileno=os.dup(theirs.fileno())) as wire:
+            for frame in (b"", b"\xa4data\xc4", *map(msgpack.packb, wrong)):
+                wire.sendto(frame, (channel, 43113))
+        for identifier in range(2000, 2300):
+            theirs.send(can.Message(arbitration_id=identifier, data=b"12"))
+        heard_of = []
+        while (frame := receive_frame(ours, 0.2)) is not None:
+            heard_of.append(frame)
+        assert heard_of[-300:] == [(identifier, b"12") for identifier in range(2000, 2300)]
+        assert len(ours._forms) <= 64 and len(ours._seen) <= 64
     finally:
         close_bus(ours)
         close_bus(theirs)
