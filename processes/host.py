@@ -153,11 +153,10 @@ class Host(Member):
         """A slot runs with the priority of a reflex while it has the drives, is about to, or is to
         show whether it could: who is judged as an ordinary process is judged for the machine's
         load. It then leaves the core of the reflex loop alone; a shadow is too slow to matter."""
-        wanted = (
-            ROWS[self.name].priority if self._rules or self.nodes.t < self._prepared_until else 0
-        )
-        if wanted != self._priority:
-            self._favour(wanted)
+        favoured = self._rules or self.nodes.t < self._prepared_until
+        priority = ROWS[self.name].priority if favoured else 0
+        if priority != self._priority:
+            self._favour(priority)
 
     def _favour(self, priority: int) -> None:
         self._priority = priority

@@ -35,7 +35,7 @@ IDENTITY: Final[Matrix] = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0
 
 
 def multiply(p: Matrix, q: Matrix) -> Matrix:
-    """p q of two rigid transformations, written out: a set-point takes forty of them."""
+    """p q of two rigid transformations, written out: each set-point takes many of them."""
     (pxx, pxy, pxz, px), (pyx, pyy, pyz, py), (pzx, pzy, pzz, pz) = p
     (qxx, qxy, qxz, qx), (qyx, qyy, qyz, qy), (qzx, qzy, qzz, qz) = q
     return (
